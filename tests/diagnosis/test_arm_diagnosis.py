@@ -99,7 +99,7 @@ def test_a_reversed_torque_is_refused(simulated: tuple[ArmBaseline, Read]) -> No
     baseline, record = simulated
     recording = record(23, None)
     reversed_sign = recording.torque * np.array([1, 1, -1, 1, 1, 1])
-    with pytest.raises(RecordingError, match="elbow: its friction comes out negative"):
+    with pytest.raises(RecordingError, match="its friction comes out negative"):
         learn_arm(baseline.loop, baseline.urdf, [replace(recording, torque=reversed_sign)])
 
 

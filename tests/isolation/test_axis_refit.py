@@ -283,7 +283,7 @@ def test_a_worn_belt_is_a_vibration_and_a_payload_on_it_has_its_own_name() -> No
     assert [fault.name for fault in loose.faults] == ["vibration"]
     assert loose.onset_s is not None
     assert loose.onset_s[0] <= 30.0 <= loose.onset_s[2]
-    assert "no coefficient explains" in str(loose.reasons[0])
+    assert any("no coefficient explains" in str(reason) for reason in loose.reasons)
     assert "backlash" in str(loose.checks[0])
     # 2 kg more behind the same belt
     heavier = replace(belt, mass=22.0, load_share=12.0 / 22.0, belt_hz=belt.belt_hz * (22.0 / 24.0) ** 0.5)

@@ -41,6 +41,7 @@ RUN = (
 # Python that no page can run, and why: the page shows a part of somebody else's program
 FRAGMENTS = {
     "fleet.md": "the frame is the reader's, in Spark; test_spark.py runs the call",
+    "how-to/robot-arm.md": "the logs are the reader's; test_arm_diagnosis.py makes the calls",
     "how-to/actions.md": "a server of the reader's; test_actions.py checks the signature so",
     "how-to/drive.md": "the image comes from a drive; test_export.py goes there and back",
     "reference/messages.md": "the sender is the reader's; test_payload.py compares with it byte by byte",

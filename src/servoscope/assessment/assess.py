@@ -126,7 +126,7 @@ def assess(log: Samples | Source, *, name: str | None = None, travel: tuple[floa
 
     Examples
     --------
-    >>> assess("monday.csv").verdict in VERDICTS
+    >>> assess("monday.csv").probabilities["stiction"] < 0.5
     True
     """
     if not isinstance(log, Samples):

@@ -19,7 +19,6 @@ from servoscope.isolation.ml.hypothesis import (
     SizePrior,
     fit_hypothesis,
     integrate_evidence,
-    log_ratio_bounds,
     refit_contenders_jointly,
     refit_jointly,
 )
@@ -40,7 +39,6 @@ MIN_LOOK_GAIN = 1.0  # of the sum of squares that a look gained, for another one
 MAX_PAIR_MISFIT = 10.0  # of what noise leaves unexplained at most, from which a pair is not followed to its onset
 WIDE_RATIO_RANGE = (0.02, 500.0)  # of a fault whose best size lies at an end of its own range
 MAX_WIDER_SEARCHES = 3  # each with more faults of that range: one, then a pair
-BOUND_SHARE = 1e-3  # of the logarithmic range, within which a size lies at its end
 MAX_SHARP_ONSET_SAMPLES = 20  # samples of an onset's interval, up to which the step is loud
 
 
@@ -64,9 +62,7 @@ class RefitResult:
 
     window: ChangeWindow  # what it looked at
     hypotheses: tuple[Hypothesis, ...]  # most probable first
-    other_parameters: tuple[
-        HypothesisFit, ...
-    ]  # parameters outside the list of faults, each as if it alone had changed
+    other_parameters: tuple[HypothesisFit, ...]  # outside the list of faults, each as if it alone had changed
     unknown_probability: float  # probability that it is none of the hypotheses
     goodness: GoodnessOfFit  # of the most probable one
     onset: OnsetEstimate  # onset, in samples of the window
@@ -109,7 +105,6 @@ def fit_hypotheses(
 
     Maximum likelihood on the innovations of the exact sampled plant (Ljung, 1999, chapter 7), so that sizes scatter as
     little as the Cramer-Rao bound allows; the healthy parameters are free as far as the baseline does not know them.
-
     The search for the onset starts at the sample `onset` and ends at that of the alarm, `announced`.
     """
     faults = baseline.plant.all_faults
@@ -132,22 +127,14 @@ def _search(
     """
     for _ in range(MAX_WIDER_SEARCHES):
         result = _HypothesisSearch(window, faults, onset, announced, progress).run()
-        ends = [fault for fault in _faults_at_ends(result.best.fitted) if fault.ratio_range != WIDE_RATIO_RANGE]
+        ends = [fault for fault in result.best.fitted.faults_at_ends if fault.ratio_range != WIDE_RATIO_RANGE]
         if not ends:
             break
         faults = [replace(fault, ratio_range=WIDE_RATIO_RANGE) if fault in ends else fault for fault in faults]
-    named = [replace(h, probability=0.0) if _faults_at_ends(h.fitted) else h for h in result.hypotheses]
-    lost = sum(h.probability for h in result.hypotheses) - sum(h.probability for h in named)
+    named = [replace(h, probability=0.0) if h.fitted.faults_at_ends else h for h in result.hypotheses]
+    unknown = result.unknown_probability + sum(h.probability for h in result.hypotheses if h.fitted.faults_at_ends)
     named.sort(key=lambda hypothesis: -hypothesis.probability)  # stable: where all vanish, the likeliest stays first
-    return replace(result, hypotheses=tuple(named), unknown_probability=result.unknown_probability + lost)
-
-
-def _faults_at_ends(fitted: HypothesisFit) -> list[Fault]:
-    """Return the faults of a hypothesis whose sizes lie at an end of their ranges."""
-    low, high = log_ratio_bounds(fitted.faults)
-    near = BOUND_SHARE * (high - low)
-    at_end = (fitted.x <= low + near) | (fitted.x >= high - near)
-    return [fault for fault, at in zip(fitted.faults, at_end, strict=True) if at]
+    return replace(result, hypotheses=tuple(named), unknown_probability=unknown)
 
 
 class _HypothesisSearch:
@@ -286,10 +273,7 @@ class _HypothesisSearch:
         return fit_hypothesis(self.window, faults, self.profile, d, starts, free=self.window.follows)
 
     def _refit_contenders(self, fitted: Sequence[HypothesisFit]) -> list[HypothesisFit]:
-        """Let the healthy parameters follow: a second fault that stands in for their error must not outrun the first.
-
-        Under a large fault they matter.
-        """
+        """Let the healthy parameters follow: a second fault must not outrun the first in the place of their error."""
         self.progress()
         followed = refit_contenders_jointly(self.window, fitted, self.noise_variance)
         best = self._update_noise_variance(followed)
@@ -341,9 +325,8 @@ class _HypothesisSearch:
         if not self.window.follows or abs(found.profile.onset - begin) <= MAX_SHARP_ONSET_SAMPLES:
             return found
         # a size that is large, and healthy parameters that follow, are not linear so far from where they were fitted
-        is_worse = (
-            self._refit_at(fitted, found.profile).cost > fitted.cost + ONSET_MISFIT_VARIANCES * self.noise_variance
-        )
+        most = fitted.cost + ONSET_MISFIT_VARIANCES * self.noise_variance
+        is_worse = self._refit_at(fitted, found.profile).cost > most
         return OnsetEstimate(fitted.profile, begin, begin, found.size_std) if is_worse else found
 
     def _weigh(self, fitted: Sequence[HypothesisFit], found: OnsetEstimate) -> RefitResult:
