@@ -68,7 +68,7 @@ def test_a_pair_has_both_sizes_and_how_they_hang_together(loop: Loop) -> None:
     diagnosis = make_diagnosis(candidates=(PAIR, NONE), faults=PAIR.faults, probability=0.96, refit=make_refit(NONE))
     page = read(diagnosis, loop)
     for words in (
-        "Pump or valve gain and internal leakage",
+        "pump or valve gain and internal leakage",
         "ps × 0.9000",
         "Cie × 1.2000",
         "sizes correlated by 0.60",
@@ -80,9 +80,13 @@ def test_a_pair_has_both_sizes_and_how_they_hang_together(loop: Loop) -> None:
     assert Diagnosis.model_validate_json(diagnosis.model_dump_json()) == diagnosis
 
 
-def test_what_would_explain_the_unknown(loop: Loop) -> None:
+def test_pairs_that_are_not_resolved_and_what_would_explain_the_unknown(loop: Loop) -> None:
+    sticky = FaultEstimate(name="friction", parameter="b_p", ratio=2.0, interval=(1.9, 2.1))
+    other = PAIR.model_copy(update={"name": "leakage + friction", "probability": 0.4, "faults": (LEAK, sticky)})
+    both = (PAIR.model_copy(update={"probability": 0.6}), other)
+    assert "changed in two ways at once" in read(make_diagnosis(candidates=both, faults=()), loop).text
     piston = Mimic(name="A_p", words="another piston area", value=1.1, unit="ratio")
     refit = make_refit(NONE, mimics=(piston,), misfit=132.0)
     page = read(make_diagnosis(candidates=(NONE, PAIR), faults=(), refit=refit), loop)
     assert "Both find no fault that explains the change." in page.text
-    assert "piston area" in page.text
+    assert "this would explain what no fault does" in page.text and "Another piston area × 1.100" in page.text

@@ -39,12 +39,13 @@ from servoscope.report.format_values import (
     format_size,
     format_with_std,
     pair_correlation,
-    symbol_parts,
+    parameter_label,
     time_decimals,
 )
 from servoscope.report.page import ResultTable, say
 
 MIN_PROBABILITY_SHOWN = 0.01  # probability below which a candidate has no line
+MIN_PROBABILITY_LIKELY = 0.05  # probability from which a candidate counts in sentences
 MAX_WARNINGS = 60
 HEALTHY_KEYS = "diagnosis.healthy", "diagnosis.healthy_limits"
 LABELS = {"fault": "Fault", "healthy": "Healthy", "undetermined": "Undetermined"}
@@ -68,6 +69,7 @@ class DiagnosisContext(NamedTuple):
     trace: Trace | None = None
     false_alarms_per_year: float | None = None
     dated: bool = False  # whether the recording has dates of its own
+    widths: tuple[ResultTable, ...] = ()  # beside the motion signature
 
     def moment(self, t: float, decimals: int = 1) -> str:
         """Return a time of the recording, as a date where it has one."""
@@ -107,7 +109,7 @@ def _sections(d: Diagnosis, known: DiagnosisContext) -> Document:
         Section(
             "Coefficients", (PicturePart("coefficients"), *_coefficients(d, known)), DETAILS, say("report.coefficients")
         ),
-        Section("Motion signature", (PicturePart("signature"),), DETAILS, say("report.signature")),
+        Section("Motion signature", (PicturePart("signature"), *known.widths), DETAILS, say("report.signature")),
     )
     return tuple(section for section in sections if section.body)
 
@@ -115,7 +117,7 @@ def _sections(d: Diagnosis, known: DiagnosisContext) -> Document:
 def _headline(d: Diagnosis, known: DiagnosisContext) -> Section:
     dated = d.headline if known.began is None else d.dated_headline(known.began, known.onset)
     if d.verdict == "fault":
-        asides = tuple(_asides(d, known.words))
+        asides = (*_asides(d, known.words), *_two_faults(d))
         body: tuple[Part, ...] = (*((Notes(asides),) if asides else ()), Facts(tuple(_fault_facts(d, known))))
         return Section(render(dated), body, HEADLINE)
     watched = Fact("Watched", format_clock_time(d.duration_s), (say("report.count", samples=d.samples),))
@@ -139,6 +141,13 @@ def _asides(d: Diagnosis, words: Mapping[str, str]) -> Iterator[str]:
         # What "more" of something means says nothing of less.
         if aside and (fault.ratio > 1.0 or not what.startswith("more")):
             yield say("report.aside", fault=what, aside=aside)
+
+
+def _two_faults(d: Diagnosis) -> Iterator[str]:
+    """Yield that two faults came at once where none is named and all that is likely is a pair."""
+    likely = [c for c in d.candidates if c.name != UNKNOWN and c.probability >= MIN_PROBABILITY_LIKELY]
+    if not d.faults and len(likely) > 1 and likely[0] is d.candidates[0] and all(len(c.faults) > 1 for c in likely):
+        yield say("report.headline.pairs")
 
 
 def _fault_facts(d: Diagnosis, known: DiagnosisContext) -> Iterator[Fact]:
@@ -175,17 +184,12 @@ def size_fact(fault: FaultEstimate) -> Fact:
     return Fact("How large", value, (say("report.interval", low=low, high=high),))
 
 
-def parameter_label(name: str) -> str:
-    """Return a parameter as its symbol, C_ie, or in words."""
-    return name if symbol_parts(name) else translate(fault_label(name))
-
-
 def _checks(d: Diagnosis, known: DiagnosisContext) -> Iterator[Part]:
     """Yield what to look at on the machine, the likeliest first."""
     if d.verdict != "fault":
         return
     texts = [str(check) for check in (d.checks if known.checks is None else known.checks)]
-    unknown = next((c for c in d.candidates if c.name == UNKNOWN and c.probability >= 0.05), None)
+    unknown = next((c for c in d.candidates if c.name == UNKNOWN and c.probability >= MIN_PROBABILITY_LIKELY), None)
     if unknown is not None:
         texts.append(say("report.check.unknown", probability=format_probability(unknown.probability)))
     if d.warnings:
@@ -249,14 +253,18 @@ def _candidate_row(c: Candidate, known: DiagnosisContext) -> tuple[str, ...]:
 
 
 def _mimic_row(mimic: Mimic) -> tuple[str, str]:
-    cause = translate(mimic.words)
-    return cause[:1].upper() + cause[1:], render(mimic.size).replace("x ", "× ")
+    cause, ratio = translate(mimic.words), mimic.unit == "ratio"
+    size = f"× {format_number(mimic.value)}" if ratio else f"{format_number(mimic.value, 3)} {mimic.unit}"
+    return cause[:1].upper() + cause[1:], size
 
 
 def _other_causes(d: Diagnosis) -> str:
-    if d.refit is None or not d.candidates or d.refit.mimics:
+    if d.refit is None or not d.candidates:
         return ""
     unknown = d.candidates[0].name == UNKNOWN
+    if d.refit.mimics:
+        outside = "Outside the list of faults, this would explain what no fault does, the likeliest first."
+        return outside if unknown else say("report.alike", fault=d.candidates[0].name)
     return say("report.none_explains" if unknown else "report.none_as_well")
 
 

@@ -10,12 +10,12 @@ from servoscope.baseline.baseline import Baseline
 from servoscope.core.messages import translate
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.diagnose import diagnose_with_trace
-from servoscope.diagnosis.motion_signature import compare_signatures
+from servoscope.diagnosis.motion_signature import MotionSignature, SignatureWidth, compare_signatures
 from servoscope.diagnosis.result import Diagnosis
 from servoscope.models.loop import Loop
 from servoscope.report.diagnosis_document import LABELS, DiagnosisContext, diagnosis_document
 from servoscope.report.document import DETAILS, Section, to_html
-from servoscope.report.format_values import format_clock_time, format_count, format_quantity
+from servoscope.report.format_values import DASH, format_clock_time, format_count, format_quantity, format_with_std
 from servoscope.report.page import ResultTable, say, write_page
 from servoscope.report.plain_values import provenance
 from servoscope.signals import Recording
@@ -74,14 +74,17 @@ def render_diagnosis_page(
     """Return the page that `write_diagnosis_page` writes; it needs nothing from outside, no script and no network."""
     from servoscope.report.plotting import render_svg  # late: matplotlib takes half a second to import
 
+    signatures = compare_signatures(recording, loop, diagnosis.onset_s[1] if diagnosis.onset_s else None)
     context = DiagnosisContext(
         words={fault.name: fault.words for fault in loop.plant.all_faults},
         units=loop.plant.units,
         coefficient_units=dict(zip(loop.plant.names, loop.plant.coefficient_units, strict=True)),
         trace=trace,
         false_alarms_per_year=loop.monitor.false_alarms_per_year,
+        widths=tuple(_widths(*signatures, loop.plant.units)),
     )
-    pictures = {name: render_svg(figure, name) for name, figure in _figures(diagnosis, trace, recording, loop)}
+    drawn = _figures(diagnosis, trace, recording, loop, signatures)
+    pictures = {name: render_svg(figure, name) for name, figure in drawn}
     return to_html(
         (*diagnosis_document(diagnosis, context), _settings(loop, provenance)),
         pictures,
@@ -101,7 +104,13 @@ def _recording_size(diagnosis: Diagnosis, loop: Loop) -> list[str]:
     return [*size, say("report.warnings", count=count)] if count else size
 
 
-def _figures(diagnosis: Diagnosis, trace: Trace, recording: Recording, loop: Loop) -> Iterator[tuple[str, Figure]]:
+def _figures(
+    diagnosis: Diagnosis,
+    trace: Trace,
+    recording: Recording,
+    loop: Loop,
+    signatures: tuple[MotionSignature | None, MotionSignature | None],
+) -> Iterator[tuple[str, Figure]]:
     """Yield the pictures of the document by name."""
     from servoscope.report import diagnosis_figures as figures
     from servoscope.report.signature_figure import plot_signature
@@ -113,9 +122,33 @@ def _figures(diagnosis: Diagnosis, trace: Trace, recording: Recording, loop: Loo
     sizes = figures.plot_fault_sizes(diagnosis)
     if sizes is not None:
         yield "sizes", sizes
-    before, after = compare_signatures(recording, loop, diagnosis.onset_s[1] if diagnosis.onset_s else None)
+    before, after = signatures
     if after is not None:
         yield "signature", plot_signature(before, after, units=loop.plant.units)
+
+
+def _widths(
+    before: MotionSignature | None, after: MotionSignature | None, units: tuple[str, str]
+) -> Iterator[ResultTable]:
+    """Yield how far apart both directions are at rest, before the onset and after it."""
+
+    def width(signature: MotionSignature | None, field: str) -> str:
+        measured: SignatureWidth | None = getattr(signature, field, None)
+        if measured is None:
+            return DASH
+        return " ± ".join(format_with_std(measured.value, 1.96 * measured.std))
+
+    rows = [
+        (translate(name), width(before, field), width(after, field), unit)
+        for name, field, unit in (
+            ("Friction band", "friction_band", units[1]),
+            ("Lost motion", "lost_motion", units[0]),
+        )
+        if getattr(after, field, None) is not None
+    ]
+    if rows:
+        table = ResultTable(("Width at rest", "Before", "After", "Unit"), rows)
+        yield table if units[1] else table.without("Unit")
 
 
 def _settings(loop: Loop, provenance: Mapping[str, str]) -> Section:

@@ -11,6 +11,7 @@ import numpy as np
 from servoscope.core import number_format
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import translate
+from servoscope.diagnosis.change_words import fault_label
 from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
 
 GREEK = {"theta": "θ", "beta": "β", "rho": "ρ"}
@@ -34,6 +35,11 @@ def symbol_parts(name: str) -> tuple[str, str] | None:
     stem, index = match[1], match[2] or ""
     letters = GREEK.get(stem, stem if index or len(stem) == 1 else "")
     return (letters, index) if letters else None
+
+
+def parameter_label(name: str) -> str:
+    """Return a parameter as its symbol, C_ie, or in words."""
+    return name if symbol_parts(name) else translate(fault_label(name))
 
 
 def text_symbol(name: str) -> str:
