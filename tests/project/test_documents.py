@@ -24,6 +24,7 @@ from sources import load
 
 import servoscope as ss
 from servoscope.cli import app
+from servoscope.models.arm.settings import ArmLoop
 from servoscope.models.loop import Loop
 from servoscope.service.config import ServiceFile
 
@@ -144,6 +145,9 @@ def test_json_is_json(name: str, block: CodeBlock) -> None:
 
 def is_read(settings: dict[str, Any]) -> bool:
     """Read a part of a loop file or of a service file, with what it leaves out; an error names what is wrong."""
+    if settings.get("kind") == "arm":
+        ArmLoop.from_dict(settings, "page")
+        return True
     if settings.keys() <= Loop.model_fields.keys():
         inertia = {"kind": "polynomial", "order": 2, "friction": "coulomb"}
         Loop.from_dict({"sample_rate": 1000.0, "plant": inertia} | settings)
