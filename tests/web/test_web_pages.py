@@ -252,6 +252,7 @@ def test_an_asset_is_live(open_page: Open) -> None:
     expect(last).to_contain_text(":")
     before, height = last.inner_text(), page.locator(".verdict").bounding_box()["height"]
     expect(last).not_to_have_text(before)
+    page.get_by_text("For experts").click()
     page.get_by_role("button", name="24 h").click()
     expect(page.get_by_role("button", name="24 h")).to_have_attribute("aria-pressed", "true")
     assert page.locator(".verdict").bounding_box()["height"] == height
