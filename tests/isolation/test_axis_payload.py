@@ -144,7 +144,7 @@ def test_a_payload_is_weighed_and_told_from_friction() -> None:
     assert [fault.name for fault in loaded.faults] == ["payload"]
     mass = loaded.faults[0].mass_kg
     assert mass is not None and mass[0] == pytest.approx(1.0, abs=0.05) and mass[1] < 1.0 + 0.02 and mass[2] > 0.98
-    assert f"payload {mass[0]:+.3g} kg" in render(loaded.headline)
+    assert f"the moved mass has changed by {mass[0]:+.3g} kg" in render(loaded.headline)
     assert json.loads(loaded.model_dump_json())["faults"][0]["mass_kg"] == list(mass)
     assert [fault.name for fault in rough.faults] == ["dry_friction"]
     assert "mass_kg" not in json.loads(rough.model_dump_json())["faults"][0]

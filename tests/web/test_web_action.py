@@ -8,7 +8,7 @@ from typing import Any
 from zoneinfo import ZoneInfo
 
 import pytest
-from opening import SIZE, Open, diagnosis_of
+from opening import SIZE, Open, diagnosis_of, shot
 from screens import asked
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is missing: make install brings it")
@@ -57,3 +57,23 @@ def test_sentences_come_in_the_readers_language_and_clock(chromium: Any, base: s
         expect(page.locator("header.top")).to_contain_text("Europe/Berlin")
         assert not re.search(r"\b(the|Fault|since|leakage)\b", verdict.inner_text())
     context.close()
+
+
+def test_an_alarm_is_acknowledged_and_another_shelved(open_page: Open, base: str) -> None:
+    page, watching = open_page("/alarms"), open_page("/assets/press-1")
+    row = page.get_by_role("row").filter(has=page.get_by_role("link", name="press-1")).first
+    expect(row).to_contain_text("piston seal and valve edges")  # without a click
+    shot(page, "alarms")
+    row.get_by_role("button", name=re.compile("^Acknowledge")).click()
+    expect(row).to_contain_text("acknowledged")
+    expect(row.get_by_role("button", name=re.compile("^Acknowledge"))).to_have_count(0)
+    expect(watching.get_by_role("region", name="Alarms of this asset")).to_contain_text("acknowledged")
+    other = page.get_by_role("row").filter(has=page.get_by_role("link", name="rig-1")).first
+    other.get_by_role("button", name=re.compile("^Shelve")).click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("Why").fill("waiting for the spare part")
+    dialog.get_by_label("For").select_option("1 h")
+    dialog.get_by_role("button", name="Shelve").click()
+    expect(other).to_contain_text("shelved until")
+    steps = {(one["asset"], one["after"]): one["who"] for one in asked(base, "/alarms/history")["transitions"]}
+    assert steps["press-1", "acknowledged"] == steps["rig-1", "shelved"] == "local"

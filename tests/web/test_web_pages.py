@@ -258,26 +258,6 @@ def test_an_asset_is_live(open_page: Open) -> None:
     assert page.locator(".verdict").bounding_box()["height"] == height
 
 
-def test_an_alarm_is_acknowledged_and_another_shelved(open_page: Open, base: str) -> None:
-    page, watching = open_page("/alarms"), open_page("/assets/press-1")
-    row = page.get_by_role("row").filter(has=page.get_by_role("link", name="press-1")).first
-    expect(row).to_contain_text("piston seal and valve edges")  # without a click
-    shot(page, "alarms")
-    row.get_by_role("button", name=re.compile("^Acknowledge")).click()
-    expect(row).to_contain_text("acknowledged")
-    expect(row.get_by_role("button", name=re.compile("^Acknowledge"))).to_have_count(0)
-    expect(watching.get_by_role("region", name="Alarms of this asset")).to_contain_text("acknowledged")
-    other = page.get_by_role("row").filter(has=page.get_by_role("link", name="rig-1")).first
-    other.get_by_role("button", name=re.compile("^Shelve")).click()
-    dialog = page.get_by_role("dialog")
-    dialog.get_by_label("Why").fill("waiting for the spare part")
-    dialog.get_by_label("For").select_option("1 h")
-    dialog.get_by_role("button", name="Shelve").click()
-    expect(other).to_contain_text("shelved until")
-    steps = {(one["asset"], one["after"]): one["who"] for one in asked(base, "/alarms/history")["transitions"]}
-    assert steps["press-1", "acknowledged"] == steps["rig-1", "shelved"] == "local"
-
-
 def test_a_diagnosis_prints_in_black_on_white(open_page: Open, base: str, tmp_path: Path) -> None:
     page = open_page(f"/diagnoses/{diagnosis_of(base, 'press-1')}", "dark")
     expect(page.get_by_role("region", name="Verdict")).to_contain_text("leakage has risen")

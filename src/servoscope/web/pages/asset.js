@@ -6,7 +6,7 @@ import { plot } from "./charts.js";
 import { commands, STATES } from "./commands.js";
 import { signals as drawn, signature, tests } from "./curves.js";
 import { editor } from "./checks.js";
-import { evidence, verdict } from "./document.js";
+import { evidence, outline, refresh, verdict } from "./document.js";
 import { h, section, table, tell, titled, translate } from "./dom.js";
 import { growth } from "./growth.js";
 import { follow } from "./live.js";
@@ -232,8 +232,9 @@ function topOf(session, path, signal) {
   const update = (asset) => {
     tests.textContent = translate(`Statistic T², × limit: ${multiple(asset.statistic)}; sequential test, × limit: ${multiple(asset.level)}; alarm at 1.`);
     status.replaceChildren(badge(asset.ne107, `NE 107: ${STATUS[asset.ne107]}${asset.reasons.length ? `, for ${asset.reasons.map(plain).join(", ")}` : ""}`), ` ${translate("Last sample")}: ${moment(asset.t)}`);
-    const now = JSON.stringify([asset.verdict, asset.sections, asset.checks]);
-    if (now === shown || element.querySelector("form :focus")) return false;
+    const now = outline(asset.verdict, [...asset.sections, asset.checks]);
+    if (element.querySelector("form :focus")) return false;
+    if (now === shown) return refresh(element, asset.sections);
     shown = now;
     element.replaceChildren(verdict(asset.verdict, asset.sections, editor(path, asset.checks, session, signal)), status);
     return true;

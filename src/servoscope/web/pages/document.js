@@ -20,6 +20,15 @@ export function verdict(kind, sections, action = null) {
   );
 }
 
+// What a verdict says but for its values, which change every second: "for 212 s".
+export const outline = (kind, sections) => JSON.stringify([kind, sections], (key, value) => (key === "facts" ? value.map((fact) => fact.name) : value));
+
+// Draw the values of a verdict of the same outline anew; what a reader has unfolded or writes in stays.
+export function refresh(element, sections) {
+  const facts = verdict("", sections).querySelectorAll("dl.facts");
+  element.querySelectorAll("dl.facts").forEach((old, i) => old.isEqualNode(facts[i]) || old.replaceWith(facts[i]));
+}
+
 // The sections of a level; `pictures` draws one by name into an element, or has none of it.
 export function drawn(sections, level, pictures = {}) {
   return sections
