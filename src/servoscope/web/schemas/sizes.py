@@ -38,6 +38,7 @@ class Note(ApiResponse):
     t: float
     text: str
     anew: bool
+    kind: str = "note"
 
 
 class NoteList(ApiResponse):
