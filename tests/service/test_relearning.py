@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from axis_logs import LOOP, axis
+from axis_logs import REPAIRED, repaired_axis
 from commands import one_line, run
 
 import servoscope as ss
@@ -20,25 +20,14 @@ from servoscope.service.config import ServiceFile
 from servoscope.service.service import Service
 from servoscope.service.store import Store
 from servoscope.service.store.series import read_notes
-from servoscope.signals.writers import write_recording
 
-REPAIRED = 1.3  # u after the repair, over u before
 TIMEOUT_S = 120.0
 
 
 @pytest.fixture
 def hall(tmp_path: Path) -> Iterator[Path]:
-    """A service that follows an axis whose motor was exchanged, and needs more current since."""
-    ss.learn(LOOP, [axis(i, seconds=60.0) for i in range(2)]).save(tmp_path / "axis.json")
-    recording = axis(7, seconds=3000.0)
-    write_recording(tmp_path / "after.csv", ss.Recording(**{**vars(recording), "u": REPAIRED * recording.u}))
-    config = tmp_path / "hall.toml"
-    config.write_text(
-        'name = "hall"\n[service]\nlisten = ""\nlog = "error"\n[store]\nurl = "history.sqlite"\n'
-        "[diagnosis]\nwindow_s = 60.0\nkeep_s = 200.0\nevery_s = 60.0\n"
-        '[sources.line]\nkind = "replay"\nspeed = 20.0\n'
-        '[assets.axis]\nbaseline = "axis.json"\nsource = "line"\nfiles = ["after.csv"]\n'
-    )
+    """A service that follows an axis whose motor was exchanged."""
+    config = repaired_axis(tmp_path)
     settings = ServiceFile.load(config)
     service = Service(settings, build_components(settings))
     thread = threading.Thread(target=service.run)
