@@ -231,7 +231,9 @@ def main() -> None:
     command.add_argument("--assets", type=int, default=200, help="assets")
     command.add_argument("--speed", type=float, default=40.0, help="times true speed")
     command.add_argument("--every", type=float, default=EVERY_S, help="mean time between disturbances, in s")
-    command.add_argument("--render", action="store_true", help="write benchmarks/reliability/RESULTS.md from the results")
+    command.add_argument(
+        "--render", action="store_true", help="write benchmarks/reliability/RESULTS.md from the results"
+    )
     command.add_argument("--kills", type=int, help="kill it so many times on each store instead")
     command.add_argument("--json", action="store_true", help="with --kills: print JSON")
     given = command.parse_args()

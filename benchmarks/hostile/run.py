@@ -42,7 +42,9 @@ def main() -> None:
     command = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     command.add_argument("--inputs", type=int, default=900, help="for each")
     command.add_argument("--only", default="", help="those whose names contain this; nothing is kept then")
-    command.add_argument("--render", action="store_true", help="write the table into benchmarks/reliability/RESULTS.md, and no more")
+    command.add_argument(
+        "--render", action="store_true", help="write the table into benchmarks/reliability/RESULTS.md, and no more"
+    )
     given = command.parse_args()
     if given.render:
         render()
