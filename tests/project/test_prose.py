@@ -93,3 +93,19 @@ def test_messages_have_short_sentences(language: str) -> None:
 def test_messages_use_the_words_of_the_field() -> None:
     plain = {key: re.sub(r"\{[^{}]*(\{[^}]*\})?[^{}]*\}", "", template) for key, template in catalogue().items()}
     assert {key: template for key, template in plain.items() if AVOIDED.search(template)} == {}
+
+
+FILE = re.compile(r"`(?:[^`\n]*[ =])?((?:[\w.-]+/)+[\w.-]+\.(?:py|md|toml|json|js|svg|png))\b[^`\n]*`")
+
+
+def test_each_file_that_a_document_names_exists() -> None:
+    """Relative to the project, the package, its tests or benchmarks, or the page; capitals stand for any name."""
+    places = [PROJECT, PROJECT / "src" / "servoscope", PROJECT / "tests", PROJECT / "benchmarks"]
+    missing = []
+    for page in (*PAGES, *RECORDS):
+        text = re.sub(r"^ *```.*?^ *```", "", page.read_text(encoding="utf-8"), flags=re.S | re.M)
+        for path in FILE.findall(text):
+            placeholder = re.search(r"\b(?!RESULTS|STUDIES|HISTORY|PAPER|NONLINEAR|RECORDINGS)[A-Z]{3,}\b", path)
+            if not placeholder and not any((place / path).exists() for place in (*places, page.parent)):
+                missing.append(f"{page.relative_to(PROJECT)}: {path}")
+    assert not missing, "\n".join(missing)
