@@ -43,7 +43,10 @@ def main() -> None:
         for name in studies[0]
         for way in ("up", "down")
     )
-    note = "30 s after the onset, a minute learned under the same reference, the noise of `simulate`, one false alarm a year."
+    note = (
+        "30 s after the onset, a minute learned under the same reference, the noise of `simulate`, one false alarm a "
+        "year."
+    )
     columns = ("change", *(head for name in REFERENCES for head in (f"{name}: detected from", "named from")))
     show([Table("Detectable sizes", note, columns, rows)], given.json)
 
