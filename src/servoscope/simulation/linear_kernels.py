@@ -150,23 +150,11 @@ def run_axis(
         for step in printer.loop(0, motion.steps):
             arrived = (printer.number(step) + 0.5) / printer.number(motion.steps) >= settings.delay_fraction
             drive = motion.gain[which[k]] * where(arrived, now, late)
-            _advance_axis(printer, motion, which[k], position, speed, drive, order)
+            advance_axis(printer, motion, which[k], position, speed, drive, order)
     s[HEADER_SIZE], s[HEADER_SIZE + 1], s[INTEGRAL] = position.value, speed.value, total.value
 
 
-@ArrayFunction
-def run_free_axis(
-    printer: Any, motion: AxisConstants, position: Any, speed: Any, u: Any, y: Any, *, order: int
-) -> None:
-    """Run the first axis driven by what acts on it, u (N,), from a position and a speed on; y (N,) is filled."""
-    at, v = Variable(printer, position), Variable(printer, speed)
-    for k in printer.loop(0, u.shape[0]):
-        y[k] = v.value if motion.speed else at.value
-        for _ in printer.loop(0, motion.steps):
-            _advance_axis(printer, motion, 0, at, v, motion.gain[0] * u[k], order)
-
-
-def _advance_axis(
+def advance_axis(
     printer: Any, motion: AxisConstants, p: Any, position: Variable, speed: Variable, drive: Any, order: int
 ) -> None:
     """Write one sub-step of an axis, driven by a force."""
