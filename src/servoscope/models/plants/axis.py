@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from servoscope.core.arrays import FloatArray
 from servoscope.models.plants.base import Fault, read_translations
 from servoscope.models.plants.columns import COLUMN_FORMS, Column
-from servoscope.models.plants.terms import DISTINCT, FROM_LIST, TermColumn, TermPlant
+from servoscope.models.plants.terms import TERM_TUPLE, UNIQUE_TERMS, TermColumn, TermPlant
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 NOT_DUMPED = Field(exclude_if=lambda value: value in (None, "position"))  # hashes of loops without it stay as they were
@@ -110,7 +110,7 @@ class AxisPlant(TermPlant):
     translations: ClassVar[Mapping[str, Mapping[str, str]]] = read_translations(__file__)
 
     kind: Literal["axis"] = "axis"
-    terms: Annotated[tuple[TermName, ...], FROM_LIST, DISTINCT] = ("viscous", "coulomb", "offset")
+    terms: Annotated[tuple[TermName, ...], TERM_TUPLE, UNIQUE_TERMS] = ("viscous", "coulomb", "offset")
     # speed [output per s] at which the term ``stribeck`` has fallen to a half
     stribeck_speed: Positive | None = None
     # distance [output] after which the term ``cogging`` repeats

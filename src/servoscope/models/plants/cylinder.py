@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from servoscope.core.errors import LoopError
 from servoscope.models.plants.base import Fault, StateSpace, read_translations
 from servoscope.models.plants.columns import Column
-from servoscope.models.plants.terms import DISTINCT, FROM_LIST, TermColumn, TermPlant
+from servoscope.models.plants.terms import TERM_TUPLE, UNIQUE_TERMS, TermColumn, TermPlant
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -109,7 +109,7 @@ class CylinderPlant(TermPlant):
     translations: ClassVar[Mapping[str, Mapping[str, str]]] = read_translations(__file__)
 
     kind: Literal["cylinder"] = "cylinder"
-    terms: Annotated[tuple[TermName, ...], FROM_LIST, DISTINCT] = (
+    terms: Annotated[tuple[TermName, ...], TERM_TUPLE, UNIQUE_TERMS] = (
         "spring",
         "overlap",
         "offset",

@@ -26,7 +26,7 @@ def _check_distinct(terms: tuple[str, ...]) -> tuple[str, ...]:
     return terms
 
 
-FROM_LIST, DISTINCT = BeforeValidator(_as_tuple), AfterValidator(_check_distinct)
+TERM_TUPLE, UNIQUE_TERMS = BeforeValidator(_as_tuple), AfterValidator(_check_distinct)
 
 
 @dataclass(frozen=True)
