@@ -26,9 +26,11 @@ MIN_WORDS_OF_A_SENTENCE = 3
 # words of everyday speech for which the field has its own: detect, report, compare, guarantee, fix
 AVOIDED = re.compile(r"\b(hears?|heard|beside|promis\w*|rehears\w*|loudest|mended|riddle\w*)\b", re.I)
 
+
 def words(text: str) -> list[str]:
     """Return the words of a page: what is between spaces and has a letter or a digit; markers of figures are none."""
     return [word for word in re.sub(r"<!--.*?-->", "", text, flags=re.S).split() if re.search(r"\w", word)]
+
 
 def paragraphs(text: str) -> Iterator[str]:
     """Yield the paragraphs of a page, the items of its lists and the cells of its tables, without code."""
@@ -49,6 +51,7 @@ def paragraphs(text: str) -> Iterator[str]:
                 parts[-1] += f" {line.strip()}"
         yield from parts
 
+
 def sentences(text: str) -> Iterator[str]:
     """Yield the sentences of a page; addresses of links are none of their words."""
     for paragraph in paragraphs(text):
@@ -57,19 +60,23 @@ def sentences(text: str) -> Iterator[str]:
             if len(words(sentence)) >= MIN_WORDS_OF_A_SENTENCE:
                 yield sentence
 
+
 def test_words_and_sentences_are_counted() -> None:
     page = "# Head\n\nOne two three. Four `a b` (six) [seven](x y.md)!\n\n    code\n\n| five cells are here | - |\n"
     assert [len(words(sentence)) for sentence in sentences(page)] == [3, 5, 4]
     assert words("a <!-- table x: y -->b<!-- end --> | --- | 3 %") == ["a", "b", "3"]
 
+
 def test_the_documents_are_short() -> None:
     assert sum(len(words(page.read_text(encoding="utf-8"))) for page in PAGES) <= MAX_WORDS
     assert sum(len(words(page.read_text(encoding="utf-8"))) for page in RECORDS) <= MAX_WORDS_OF_RECORDS
+
 
 def test_few_sentences_are_long() -> None:
     found = [(page.name, sentence) for page in PAGES for sentence in sentences(page.read_text(encoding="utf-8"))]
     long = [f"{name}: {text.strip()}" for name, text in found if len(words(text)) > MAX_WORDS_OF_A_SENTENCE]
     assert len(long) <= MAX_SHARE_OF_LONG_SENTENCES * len(found), "\n".join(long)
+
 
 @pytest.mark.parametrize("language", ["en", "de"])
 def test_messages_have_short_sentences(language: str) -> None:
@@ -82,11 +89,14 @@ def test_messages_have_short_sentences(language: str) -> None:
     }
     assert not long
 
+
 def test_messages_use_the_words_of_the_field() -> None:
     plain = {key: re.sub(r"\{[^{}]*(\{[^}]*\})?[^{}]*\}", "", template) for key, template in catalogue().items()}
     assert {key: template for key, template in plain.items() if AVOIDED.search(template)} == {}
 
+
 FILE = re.compile(r"`(?:[^`\n]*[ =])?((?:[\w.-]+/)+[\w.-]+\.(?:py|md|toml|json|js|svg|png))\b[^`\n]*`")
+
 
 def test_each_file_that_a_document_names_exists() -> None:
     """Relative to the project, the package, its tests or benchmarks, or the page; capitals stand for any name."""
@@ -99,6 +109,7 @@ def test_each_file_that_a_document_names_exists() -> None:
             if not placeholder and not any((place / path).exists() for place in (*places, page.parent)):
                 missing.append(f"{page.relative_to(PROJECT)}: {path}")
     assert not missing, "\n".join(missing)
+
 
 def test_each_picture_is_shown_by_a_page() -> None:
     pages = "".join(page.read_text(encoding="utf-8") for page in PAGES)
