@@ -26,10 +26,9 @@ def load_word(data: Any, i: int) -> Any:
 
 @intrinsic
 def as_float(typing: Any, word: Any) -> Any:
-    """Return the number whose bits a word is: binary64, or binary32 of one of 32 bits."""
-    kind = types.float64 if word.bitwidth == 64 else types.float32
-    return kind(word), lambda context, builder, signature, values: builder.bitcast(
-        values[0], context.get_value_type(kind)
+    """Return the binary64 whose bits a word is."""
+    return types.float64(word), lambda context, builder, signature, values: builder.bitcast(
+        values[0], context.get_value_type(types.float64)
     )
 
 
