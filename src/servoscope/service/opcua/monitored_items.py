@@ -6,15 +6,11 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 
-class ItemRequest(NamedTuple):
-    """What is asked for a node: the interval at which it is sampled [ms], and how many values the server keeps."""
+class ItemTerms(NamedTuple):
+    """How a node is watched: the interval at which it is sampled [ms], and how many values the server keeps.
 
-    sampling_ms: float
-    queue: int
-
-
-class ItemGrant(NamedTuple):
-    """What the server grants: `sampling_ms` and `queue` as it has revised them; `refusal`: why nothing, else empty."""
+    As it is asked for, or as the server has revised it; `refusal`: why it grants nothing, else empty.
+    """
 
     sampling_ms: float
     queue: int
@@ -37,7 +33,7 @@ class _AnswerRecorder:
         return self.answers
 
 
-async def monitor_nodes(subscription: Any, wanted: Mapping[str, ItemRequest], first: int) -> dict[str, ItemGrant]:
+async def monitor_nodes(subscription: Any, wanted: Mapping[str, ItemTerms], first: int) -> dict[str, ItemTerms]:
     """Subscribe to nodes; return what the server grants of each. `first`: number of the first, unique in it."""
     from asyncua import ua
     from asyncua.ua.attribute_ids import AttributeIds
@@ -49,7 +45,7 @@ async def monitor_nodes(subscription: Any, wanted: Mapping[str, ItemRequest], fi
             ua.MonitoringMode.Reporting,
             ua.MonitoringParameters(ClientHandle=k, SamplingInterval=sampling, QueueSize=queue, Filter=stamped),
         )
-        for k, (node, (sampling, queue)) in enumerate(wanted.items(), first)
+        for k, (node, (sampling, queue, _)) in enumerate(wanted.items(), first)
     ]
     session = subscription.server
     subscription.server = recorder = _AnswerRecorder(session)
@@ -58,9 +54,9 @@ async def monitor_nodes(subscription: Any, wanted: Mapping[str, ItemRequest], fi
     finally:
         subscription.server = session
     return {
-        node: ItemGrant(one.RevisedSamplingInterval, one.RevisedQueueSize)
+        node: ItemTerms(one.RevisedSamplingInterval, one.RevisedQueueSize)
         if one.StatusCode.is_good()
-        else ItemGrant(0.0, 0, one.StatusCode.name)
+        else ItemTerms(0.0, 0, one.StatusCode.name)
         for node, one in zip(wanted, recorder.answers, strict=True)
     }
 

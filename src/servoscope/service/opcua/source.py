@@ -19,13 +19,12 @@ from servoscope.core.addresses import show_address
 from servoscope.core.errors import ConfigError
 from servoscope.core.messages import message, render
 from servoscope.core.settings import NonEmptyStr
-from servoscope.service.assets.reception import AssetTrouble
+from servoscope.service.assets.reception import Reception
 from servoscope.service.config_types import Seconds, read_password
 from servoscope.service.log import log
 from servoscope.service.network import ConnectionSettings
 from servoscope.service.opcua.monitored_items import (
-    ItemGrant,
-    ItemRequest,
+    ItemTerms,
     monitor_nodes,
     publishing_interval,
     shorten_interval,
@@ -146,7 +145,7 @@ class OpcuaTransport(Transport):
         self.trouble, self.connected = render(message("service.trouble.connecting")), False
 
     @property
-    def asset_troubles(self) -> dict[str, AssetTrouble]:  # type: ignore[override]
+    def asset_troubles(self) -> dict[str, Reception]:  # type: ignore[override]
         """Assets whose nodes are refused, or come too slowly."""
         return {one.asset: one.trouble for one in self._subscriptions if one.trouble is not None}
 
@@ -202,7 +201,7 @@ class OpcuaTransport(Transport):
         values: deque[tuple[Any, Any]] = deque()
         handler, period = _SubscriptionHandler(values), self.settings.publishing_s
         subscription = await client.create_subscription(1000.0 * period, handler)
-        grants = dict[str, ItemGrant]()
+        grants = dict[str, ItemTerms]()
         period = await self._subscribe(subscription, grants)
         heartbeat = ua.NodeId.from_string(self.settings.heartbeat)
         now = _parse_heartbeat(await client.get_node(heartbeat).read_data_value())
@@ -231,18 +230,18 @@ class OpcuaTransport(Transport):
                 retry_at = time.monotonic() + RETRY_NODES_S
                 period = await self._subscribe(subscription, grants)
 
-    async def _subscribe(self, subscription: Any, grants: dict[str, ItemGrant]) -> float:
+    async def _subscribe(self, subscription: Any, grants: dict[str, ItemTerms]) -> float:
         """Subscribe to the heartbeat and to all nodes that are not yet granted; return the publishing interval [s].
 
         A server may grant less than it was asked for: where its queues are shorter, messages have to come sooner.
         """
         period, heartbeat = publishing_interval(subscription), self.settings.heartbeat
         wanted = {
-            node: ItemRequest(one.sampling_ms, one.queue_size(period))
+            node: ItemTerms(one.sampling_ms, one.queue_size(period))
             for one in self._subscriptions
             for node in one.nodes
         }
-        wanted[heartbeat] = ItemRequest(1000.0 * period, 1)
+        wanted[heartbeat] = ItemTerms(1000.0 * period, 1)
         missing = {node: one for node, one in wanted.items() if node not in grants or grants[node].refusal}
         changed = [one for one in self._subscriptions if not missing.keys().isdisjoint(one.nodes)]
         grants |= await monitor_nodes(subscription, missing, self._handles)

@@ -13,8 +13,8 @@ import numpy as np
 
 from servoscope.core.errors import MessageError
 from servoscope.core.messages import message, render
-from servoscope.service.assets.reception import AssetTrouble
-from servoscope.service.opcua.monitored_items import ItemGrant
+from servoscope.service.assets.reception import Reception
+from servoscope.service.opcua.monitored_items import ItemTerms
 from servoscope.service.sources.assembly import SIGNALS, BlockAssembler
 from servoscope.service.sources.block import MAX_TIME_S, Block, ResumePosition
 from servoscope.service.sources.message import RejectionCounter
@@ -51,19 +51,19 @@ class _Subscription(ABC):
         self.asset, self.nodes, self._covariates = asset, nodes, covariates
         self._sequence, self._last_t = resume.sequence, resume.last_t
         self._emit, self._rejections = emit, rejections
-        self.trouble: AssetTrouble | None = None  # why there are no samples although the server is there
+        self.trouble: Reception | None = None  # why there are no samples although the server is there
 
     def queue_size(self, publishing_s: float) -> int:
         """Return how many values the server keeps between two messages: those of two intervals, and twice that."""
         return max(10, math.ceil(2 * QUEUE_MARGIN * publishing_s / self.value_s))
 
-    def check_grants(self, grants: Mapping[str, ItemGrant], publishing_s: float) -> None:
+    def check_grants(self, grants: Mapping[str, ItemTerms], publishing_s: float) -> None:
         """Take what the server grants of each node, and of the time between two messages [s]."""
         refused = [(node, grants[node].refusal) for node in self.nodes if grants[node].refusal]
         words = [render(message("service.trouble.node", node=node, reason=reason)) for node, reason in refused]
-        self.trouble = AssetTrouble("refused", ", ".join(words)) if words else None
+        self.trouble = Reception("refused", ", ".join(words)) if words else None
 
-    def longest_interval_s(self, grants: Mapping[str, ItemGrant]) -> float:
+    def longest_interval_s(self, grants: Mapping[str, ItemTerms]) -> float:
         """Return how long messages may be apart before values are lost [s]; of blocks nobody knows."""
         return math.inf
 
@@ -128,12 +128,12 @@ class ScalarSubscription(_Subscription):
         self._granted_ms: dict[int, float] = {}  # what the server says of signals that it would sample too slowly
         self._short_queues, self._undecided = "", False
 
-    def longest_interval_s(self, grants: Mapping[str, ItemGrant]) -> float:
+    def longest_interval_s(self, grants: Mapping[str, ItemTerms]) -> float:
         """Return how long messages may be apart before the shortest queue of its nodes runs over [s]."""
         queues = [grants[node].queue for node in self.nodes[: len(SIGNALS)] if not grants[node].refusal]
         return self.value_s * max(1, min(queues, default=0)) if queues else math.inf
 
-    def check_grants(self, grants: Mapping[str, ItemGrant], publishing_s: float) -> None:
+    def check_grants(self, grants: Mapping[str, ItemTerms], publishing_s: float) -> None:
         """Take what the server grants: slower than the samples it has no samples for us."""
         super().check_grants(grants, publishing_s)
         self._assembler.restart_rates()
@@ -165,7 +165,7 @@ class ScalarSubscription(_Subscription):
         slow = self._assembler.slow_ms | self._granted_ms
         words = [self._assembler.describe_slow(k, interval_ms) for k, interval_ms in sorted(slow.items())]
         words += [self._short_queues] if self._short_queues else []
-        self.trouble = AssetTrouble("slow", ", ".join(words)) if words else None
+        self.trouble = Reception("slow", ", ".join(words)) if words else None
         self._undecided = bool(self._granted_ms) and False not in told
 
     async def read_missed(self, client: Any, now: float) -> None:

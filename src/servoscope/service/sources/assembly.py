@@ -13,7 +13,7 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import message, render
-from servoscope.service.assets.reception import AssetTrouble
+from servoscope.service.assets.reception import Reception
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.message import RejectionCounter, SignalValue
 from servoscope.service.sources.resample import Resampler, SampleGap
@@ -171,7 +171,7 @@ class AssetStream(BlockAssembler):
         self._places = [self.signals.index(one) if one in self.signals else -1 for one in (*SIGNALS, *known)]
         self.open = deque[_OpenMessage]()
         self._seen: dict[int, None] = {}
-        self.trouble: AssetTrouble | None = None
+        self.trouble: Reception | None = None
         # heard_at: when r, u or y came last, by the monotonic clock [s]
         self.heard_at, self._values_taken, self._from = time.monotonic(), 0, math.nan
         self._complete, self.is_flushed = False, True
@@ -227,7 +227,7 @@ class AssetStream(BlockAssembler):
             self.resampler.take_covariates()
         if self.trouble is None or self.trouble.state == "slow":
             words = [self.describe_slow(k, interval_ms) for k, interval_ms in self.slow_ms.items()]
-            self.trouble = AssetTrouble("slow", ", ".join(words)) if words else None
+            self.trouble = Reception("slow", ", ".join(words)) if words else None
         if self.trouble is not None:
             self.discard(0, self.trouble.state, self.trouble.why)
         blocks = self.take_blocks(short=short)

@@ -24,7 +24,7 @@ from servoscope.core.errors import EmptyRecordingError, OutputError
 from servoscope.core.messages import message as text
 from servoscope.core.messages import render
 from servoscope.core.settings import NonEmptyStr
-from servoscope.service.assets.reception import AssetTrouble
+from servoscope.service.assets.reception import Reception
 from servoscope.service.config_types import Seconds
 from servoscope.service.log import log
 from servoscope.service.sources.block import Block, ResumePosition
@@ -314,7 +314,7 @@ class FolderTransport(Transport):
         except FileNotFoundError:  # somebody has moved it
             return
         except PermissionError as error:  # it may be open elsewhere: it is tried again
-            refused = AssetTrouble("refused", f"{path}: cannot be read ({error.strerror})")
+            refused = Reception("refused", f"{path}: cannot be read ({error.strerror})")
             if self.asset_troubles.get(assets[0]) != refused:
                 self.rejections.add(file.asset, "unreadable", refused.why)
             self.asset_troubles = {**self.asset_troubles, **dict.fromkeys(assets, refused)}
@@ -342,7 +342,7 @@ class FolderTransport(Transport):
         for why in dict.fromkeys(failures.values()):
             self.rejections.add(file.asset, "unreadable", why)
         kept = {name: one for name, one in self.asset_troubles.items() if name not in assets or not rows}
-        self.asset_troubles = kept | {name: AssetTrouble("refused", why) for name, why in failures.items()}
+        self.asset_troubles = kept | {name: Reception("refused", why) for name, why in failures.items()}
         is_new = file.name not in (self._first_names or ())
         read = ReadFile(file, rows, is_new, FAILED if failures else DONE)
         while self.waiting and not self._stop_event.wait(POLL_S):

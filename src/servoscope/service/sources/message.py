@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from servoscope.core.errors import MessageError
 from servoscope.models.loop import Loop
-from servoscope.service.assets.reception import AssetTrouble
+from servoscope.service.assets.reception import Reception
 from servoscope.service.sources.block import Block, ResumePosition
 
 POLL_S = 0.02  # between two looks at a transport whose messages come from a thread of its own
@@ -151,7 +151,7 @@ class Transport(ABC):
     keeps = True  # whether what was not released comes again, so that messages may wait; else blocks are dropped
     connected = True
     trouble = ""  # why nothing can be received, in words; empty: nothing is wrong
-    asset_troubles: Mapping[str, AssetTrouble] = NOTHING
+    asset_troubles: Mapping[str, Reception] = NOTHING
     update_intervals_s: Mapping[tuple[str, str], float] = NOTHING
     layer_seconds: Mapping[str, float] = NOTHING
     pause_s = 0.0  # how long an asset may pause without being silent [s]
