@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import math
 import re
-import threading
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -40,7 +39,7 @@ from servoscope.service.opcua.settings import (
 from servoscope.service.opcua.subscriptions import QUEUE_MARGIN, ArraySubscription, ScalarSubscription, timestamp
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.inbox import Inbox
-from servoscope.service.sources.message import BlockDecoder, InboxMessage, SourceAsset, Transport
+from servoscope.service.sources.message import BlockDecoder, InboxMessage, SourceAsset, ThreadTransport
 from servoscope.service.sources.settings import SourceSettings
 
 SETTLING_S = 2.0  # behind the server's clock: a change that has not been reported by then has not happened
@@ -121,7 +120,7 @@ class _SubscriptionHandler:
         self.end_status = str(status.Status)
 
 
-class OpcuaTransport(Transport):
+class OpcuaTransport(ThreadTransport):
     """Subscribes to the nodes of several assets, and makes blocks of their values.
 
     A server waits for no acknowledgement: what was not stored is read from its history after a restart.
@@ -138,8 +137,7 @@ class OpcuaTransport(Transport):
         self._assets = dict(assets)
         check_nodes(settings.heartbeat, *(node for one in self._assets.values() for node in one.address.given))
         self._handles = 1  # of the next item that is monitored
-        self._stop_event = threading.Event()
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), name="opcua", daemon=True)
+        self.ends_within_s = 2.0 * settings.heartbeat_s
         self._subscriptions: list[ArraySubscription | ScalarSubscription] = []
         self._last_heartbeat = self._server_time = math.nan
         self.trouble, self.connected = render(message("service.trouble.connecting")), False
@@ -165,13 +163,16 @@ class OpcuaTransport(Transport):
                 signals = [*nodes.signals, *(nodes.covariates[one] for one in wanted)]
                 size = max(1, round(self.settings.block * rate))
                 self._subscriptions.append(ScalarSubscription(name, signals, at, *common, rate, size, wanted))
-        self._thread.start()
+        super().open(resume)
 
     def _enqueue(self, block: Block) -> None:
         self.waiting.append(InboxMessage(block.asset, block, block.completed_at))
 
-    async def _run(self) -> None:
-        """Follow the server through its restarts, in a thread of its own."""
+    def _run(self) -> None:
+        asyncio.run(self._follow())
+
+    async def _follow(self) -> None:
+        """Follow the server through its restarts."""
         while not self._stop_event.is_set():
             try:
                 async with await create_opcua_client(self.settings, self._password, self._folder) as client:
@@ -254,12 +255,6 @@ class OpcuaTransport(Transport):
         for one in changed:
             one.check_grants(grants, period)
         return period
-
-    def close(self) -> None:
-        """Disconnect."""
-        self._stop_event.set()
-        if self._thread.is_alive():
-            self._thread.join(2.0 * self.settings.heartbeat_s)
 
 
 def _parse_heartbeat(value: Any) -> float:

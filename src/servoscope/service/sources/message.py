@@ -198,6 +198,31 @@ class Transport(ABC):
         """Stop; it may be called twice."""
 
 
+class ThreadTransport(Transport):
+    """Follows its source in a thread of its own, from `open` to `close`."""
+
+    ends_within_s = 10.0  # how long `close` waits for its end [s]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._stop_event = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=type(self).__name__, daemon=True)
+
+    def open(self, resume: Mapping[str, ResumePosition]) -> None:
+        """Begin, now or as soon as there is a connection."""
+        self._thread.start()
+
+    @abstractmethod
+    def _run(self) -> None:
+        """Follow the source until `_stop_event` is set."""
+
+    def close(self) -> None:
+        """Stop."""
+        self._stop_event.set()
+        if self._thread.is_alive():
+            self._thread.join(self.ends_within_s)
+
+
 class BlockDecoder(Decoder):
     """For transports whose messages are blocks already."""
 
