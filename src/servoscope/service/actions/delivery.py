@@ -85,15 +85,18 @@ def signature(secret: bytes, timestamp: str, body: bytes) -> str:
 
 def _send(rows: Sequence[OutboxEntry], sink: Sink) -> str:
     row = rows[0]
-    match sink:
-        case WebhookSettings():
-            return _post(row, sink)
-        case CommandSettings():
-            return _run_command(row, sink)
-        case MqttMessageSettings():
-            return _publish(row, sink)
-        case EmailSettings():
-            return _mail(rows, sink)
+    try:
+        match sink:
+            case WebhookSettings():
+                return _post(row, sink)
+            case CommandSettings():
+                return _run_command(row, sink)
+            case MqttMessageSettings():
+                return _publish(row, sink)
+            case EmailSettings():
+                return _mail(rows, sink)
+    except ConfigError as error:
+        raise _DeliveryError(str(error)) from None
 
 
 def _mail(rows: Sequence[OutboxEntry], sink: EmailSettings) -> str:
@@ -106,10 +109,7 @@ def _mail(rows: Sequence[OutboxEntry], sink: EmailSettings) -> str:
 
 def _publish(row: OutboxEntry, sink: MqttMessageSettings) -> str:
     host, port = sink.broker.address
-    try:
-        client = create_mqtt_client(sink.broker, Path(), "")
-    except ConfigError as error:
-        raise _DeliveryError(str(error)) from None
+    client = create_mqtt_client(sink.broker, Path(), "")
     client.connect_timeout = sink.timeout_s
     try:
         client.connect(host, port)
@@ -134,10 +134,7 @@ def _post(row: OutboxEntry, sink: WebhookSettings) -> str:
         raise _DeliveryError("webhooks need httpx: pip install 'servoscope[service]'") from None
     body = json.dumps(row.event, allow_nan=False).encode()
     headers = {"Content-Type": "application/json", "Idempotency-Key": row.key}
-    try:
-        secret = sink.load_secret(Path())
-    except ConfigError as error:
-        raise _DeliveryError(str(error)) from None
+    secret = sink.load_secret(Path())
     if secret is not None:
         # by the clock of the machine, which receivers compare with theirs
         stamp = str(int(time.time()))
