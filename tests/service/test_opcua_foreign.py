@@ -16,15 +16,14 @@ from oidc_provider import found_node
 from test_opcua import certificate, free_port, source_assets
 
 from servoscope.core.errors import ConfigError
-from servoscope.service.opcua.monitored_items import ItemTerms
 from servoscope.service.opcua.settings import OpcuaNodes, describe_expiry
 from servoscope.service.opcua.source import OpcuaSourceSettings
-from servoscope.service.opcua.subscriptions import ScalarSubscription
+from servoscope.service.opcua.subscriptions import ItemTerms, ScalarSubscription
+from servoscope.service.sources.assembly import STEPS, UpdateRate
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.inbox import Inbox
 from servoscope.service.sources.message import RejectionCounter
 from servoscope.service.sources.resample import Resampler
-from servoscope.service.sources.update_rate import STEPS, UpdateRate
 
 SERVER = Path(__file__).parents[1] / "support" / "opcua_server" / "plant.js"
 RATE = 20.0

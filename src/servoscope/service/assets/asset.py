@@ -36,12 +36,19 @@ from servoscope.service.assets.examination_schedule import (
 from servoscope.service.assets.outlook import AssetLimits, Outlook, PrognosisSettings, single_fault
 from servoscope.service.assets.recent_blocks import PackedBlock, RecentBlocks
 from servoscope.service.assets.reception import RECEPTION_OK, Reception
-from servoscope.service.assets.records import REPEATABLE_TABLES, BlockRefusal, StepResult, TableRow, transition_row
+from servoscope.service.assets.records import (
+    REPEATABLE_TABLES,
+    BlockRefusal,
+    NextBlock,
+    StepResult,
+    TableRow,
+    check_continuity,
+    transition_row,
+)
 from servoscope.service.assets.states import AssetStates, RestPeriod, StateHolder
 from servoscope.service.assets.status import AssetStatus, asset_metadata, asset_status
 from servoscope.service.config import DiagnosisSettings
 from servoscope.service.sources.block import Block
-from servoscope.service.sources.continuity import NextBlock, check_continuity
 from servoscope.service.store.bundles import pack_samples
 from servoscope.service.store.rows import coefficient_rows, fault_rows, period_number
 from servoscope.signals import quality

@@ -18,10 +18,11 @@ from servoscope.service.mqtt.number_kernels import (
     CLOSING_BYTES,
     Text,
     Word,
+    as_float,
+    load_word,
     read_number,
     read_whole,
 )
-from servoscope.service.mqtt.words import as_float, load_word
 from servoscope.service.sources.block import MAX_COUNT, MAX_TIME_S
 
 NAMES = b"version", b"stream", b"sequence", b"oldest", b"t0", b"dt", b"t", b"r", b"u", b"y"

@@ -22,12 +22,6 @@ from servoscope.service.assets.reception import Reception
 from servoscope.service.config_types import Seconds, read_password
 from servoscope.service.log import log
 from servoscope.service.network import ConnectionSettings
-from servoscope.service.opcua.monitored_items import (
-    ItemTerms,
-    monitor_nodes,
-    publishing_interval,
-    shorten_interval,
-)
 from servoscope.service.opcua.settings import (
     CertificateSettings,
     OpcuaNodes,
@@ -36,7 +30,16 @@ from servoscope.service.opcua.settings import (
     describe_expiry,
     import_asyncua,
 )
-from servoscope.service.opcua.subscriptions import QUEUE_MARGIN, ArraySubscription, ScalarSubscription, timestamp
+from servoscope.service.opcua.subscriptions import (
+    QUEUE_MARGIN,
+    ArraySubscription,
+    ItemTerms,
+    ScalarSubscription,
+    monitor_nodes,
+    publishing_interval,
+    shorten_interval,
+    timestamp,
+)
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.inbox import Inbox
 from servoscope.service.sources.message import BlockDecoder, InboxMessage, SourceAsset, ThreadTransport
