@@ -29,10 +29,10 @@ from servoscope.service.health import HealthReport
 from servoscope.service.housekeeping import Housekeeping
 from servoscope.service.log import log, set_level
 from servoscope.service.metrics import ServiceMetrics
+from servoscope.service.process_supervisor import notify_systemd
 from servoscope.service.reload import reload_components
 from servoscope.service.sources.block import Block
 from servoscope.service.sources.inbox import Inbox
-from servoscope.service.systemd import notify_systemd
 from servoscope.service.writer import StoreWriter
 
 MAX_BLOCKS_PER_POLL = 1024  # blocks of one source that are processed before it is another one's turn

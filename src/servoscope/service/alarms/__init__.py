@@ -19,7 +19,15 @@ from servoscope.service.alarms.lifecycle import (
     next_event_time,
     step_alarm,
 )
-from servoscope.service.alarms.records import AlarmState, AlarmTransition, OperatorCommand
+from servoscope.service.alarms.records import (
+    COMMANDS,
+    TRANSITION_TABLE,
+    AlarmState,
+    AlarmTransition,
+    LifecycleEvent,
+    LifecycleState,
+    OperatorCommand,
+)
 from servoscope.service.alarms.settings import (
     DEFAULT_ALARMS,
     FAULT_ALARM,
@@ -31,7 +39,6 @@ from servoscope.service.alarms.settings import (
     Priority,
     alarm_kind,
 )
-from servoscope.service.alarms.state_table import COMMANDS, TRANSITION_TABLE, LifecycleEvent, LifecycleState
 
 __all__ = [
     "COMMANDS", "DEFAULT_ALARMS", "FAULT_ALARM", "PRIORITIES", "TRANSITION_TABLE", "AlarmDefinition", "AlarmSettings",

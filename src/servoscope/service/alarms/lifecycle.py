@@ -13,16 +13,18 @@ from typing import Any, NamedTuple, get_args
 from servoscope.core.errors import AlarmError
 from servoscope.core.messages import message, render
 from servoscope.service.alarms.conditions import AssetSnapshot, describe_cause, evaluate_condition
-from servoscope.service.alarms.records import AlarmState, AlarmTransition, OperatorCommand
-from servoscope.service.alarms.settings import AlarmDefinition, Ne107
-from servoscope.service.alarms.state_table import (
+from servoscope.service.alarms.records import (
     COMMANDS,
     LATCHED_STATES,
+    AlarmState,
+    AlarmTransition,
     LifecycleEvent,
     LifecycleState,
+    OperatorCommand,
     ReleaseCondition,
     next_state,
 )
+from servoscope.service.alarms.settings import AlarmDefinition, Ne107
 
 SYSTEM_USER = "system"  # where nobody commanded a transition
 EVENT_FLAGS: dict[LifecycleEvent, dict[str, Any]] = {  # what an event says of condition and design
