@@ -89,8 +89,8 @@ class ReplayClient(BrokerConnection):
             name: (tuple(settings.folder / file for file in one.files), Loop.load(settings.folder / one.loop))
             for name, one in settings.assets.items()
         }
-        covariates = {name: tuple(loop.columns.covariates) for name, (_, loop) in files.items()}
-        self._replay = ReplayTransport(settings.replay.model_copy(update={"start": start}), files, covariates)
+        self._covariates = {name: tuple(loop.columns.covariates) for name, (_, loop) in files.items()}
+        self._replay = ReplayTransport(settings.replay.model_copy(update={"start": start}), files, self._covariates)
         super().__init__(settings.broker, create_mqtt_client(settings.broker, settings.folder, ""))
         self._client.on_message = self._on_message
         self._acks: SimpleQueue[tuple[str, int, int]] = SimpleQueue()
@@ -194,7 +194,7 @@ class ReplayClient(BrokerConnection):
         if self.settings.format == "binary":
             message = payload.encode_binary(block, oldest)
         else:
-            message = payload.encode_json(block, oldest, self._replay.covariates(block.asset))
+            message = payload.encode_json(block, oldest, self._covariates[block.asset])
         blocks.append(_UnacknowledgedBlock(block.sequence, message))
 
     def _send(self, asset: str, one: _UnacknowledgedBlock) -> None:
