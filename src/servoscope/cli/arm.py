@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from servoscope.cli.exit import EXIT_FAULT, FailureCounter, print_json
-from servoscope.cli.output_paths import OutputPaths, recording_stem
+from servoscope.cli.output_paths import OutputPaths
 
 if TYPE_CHECKING:
     from servoscope.baseline.arm import ArmBaseline
@@ -85,9 +85,7 @@ def diagnose_logs(
             else:
                 diagnosis.print_diagnosis(results.create_console(), result, details)
             if pages is not None:
-                target = pages.path(recording_stem(path, recording.name))
-                write_arm_page(target, result, examination, baseline)
-                results.print_written_path(results.create_console(stderr=as_json), target)
+                pages.write(path, recording.name, write_arm_page, result, examination, baseline, stderr=as_json)
     if fail_on_fault and faulty:
         raise typer.Exit(EXIT_FAULT)
     failures.exit_if_any()
