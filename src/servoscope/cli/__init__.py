@@ -8,6 +8,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from servoscope.cli import (  # their commands add themselves to the application
     alarms,
     assess,
+    baseline,
     bench,
     export,
     fleet,
@@ -27,6 +28,7 @@ __all__ = [
     "alarms",
     "app",
     "assess",
+    "baseline",
     "bench",
     "export",
     "fleet",
