@@ -63,7 +63,10 @@ def axis_motion(seed: int, seconds: float, amplitude: float, *faults: FaultEvent
 
 
 def axis_loop(_: float, rate: float) -> ss.Loop:
-    return ss.Loop.from_dict({"sample_rate": rate, "plant": {"kind": "axis", "terms": AXIS["plant"]["terms"]}})
+    hold = "zoh" if rate == AXIS["sample_rate"] else "foh"  # u moves between the samples of a slower log
+    return ss.Loop.from_dict(
+        {"sample_rate": rate, "hold": hold, "plant": {"kind": "axis", "terms": AXIS["plant"]["terms"]}}
+    )
 
 
 def rig_motion(seed: int, seconds: float, amplitude: float, *faults: FaultEvent) -> ss.Recording:

@@ -43,8 +43,8 @@ class DriveLag(NamedTuple):
     def of_input(self, u: FloatArray, restart: BoolArray, sample_rate: float) -> FloatArray:
         """Return the force's mean from each sample to the next, shape (N,), of u that is held; each run begins settled.
 
-        A delay between two samples is the mean of both, which is exact for a u that is held. It may be negative, for a
-        controller that runs faster than its log: by half a sample, u runs in straight lines.
+        A delay between two samples is the mean of both, which is exact for a u that is held. It may be negative: by
+        half a sample, u runs in straight lines.
         """
         if not any(self):
             return u

@@ -35,7 +35,6 @@ MIN_SAMPLES_PER_COLUMN = 10  # samples in motion
 DELAYS_S, LAGS_S = np.arange(0.0, 0.1, 0.01), (0.0, 0.01, 0.02, 0.04, 0.08)  # that are tried first
 MIN_DRIVE_GAIN = 50.0  # of twice the log-likelihood, for a delay and a lag
 MIN_DRIVE_S = 5e-3  # of both together: less is what the sampling or a compliant coupling does
-MIN_EARLY_SAMPLES = 0.25  # of the filter, by which u may act before it is logged: the controller is faster than its log
 MAX_DRIVE_ROUNDS = 3  # of delay and lag, and noise, in turns
 STEPS, FIRST_STEP = 250, 0.7  # of the search for the noise: steps, and the logarithm of the first ones
 
@@ -172,7 +171,6 @@ def fit_drive(
     from scipy.optimize import minimize
 
     rate, stride = loop.sample_rate, round(loop.sample_rate / problems[0].signals.sample_rate)
-    earliest = -0.5 / rate
     fixed = []
     for recording, problem in zip(recordings, problems, strict=True):
         X, e, filter = problem.regress(noise, slow)
@@ -180,11 +178,8 @@ def fit_drive(
         where = problem.signals.moving(slow, filter.settling)
         fixed.append((recording, Q, e - Q @ (Q.T @ e), filter, where, problem.signals.runs))
 
-    def as_drive(x: FloatArray) -> DriveLag:
-        return DriveLag(max(float(x[0]), earliest), abs(float(x[1])))
-
     def cost(x: FloatArray) -> float:
-        drive, total, count = as_drive(x), 0.0, 0
+        drive, total, count = DriveLag(*np.abs(x).tolist()), 0.0, 0
         for recording, Q, e, filter, where, runs in fixed:
             u = axis_signals(loop, recording, stride, drive, moves).force
             column = filter.of_acceleration(u, runs)[where]
@@ -194,13 +189,13 @@ def fit_drive(
             count += len(e)
         return count * float(np.log(max(total, np.finfo(np.float64).tiny)))
 
-    grid = [np.array([delay, lag]) for delay in (earliest, *DELAYS_S) for lag in LAGS_S]
+    grid = [np.array([delay, lag]) for delay in DELAYS_S for lag in LAGS_S]
     start = min([np.array(known), *grid], key=cost)
     simplex = start + 0.5 * max(np.diff(DELAYS_S)) * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     found = minimize(cost, start, method="Nelder-Mead", options={"xatol": 0.02 / rate, "initial_simplex": simplex})
-    late = as_drive(found.x)
-    matters = sum(late) > max(MIN_DRIVE_S, 1.0 / rate) or sum(late) * rate / stride < -MIN_EARLY_SAMPLES
-    return late if matters and cost(np.array(known)) - float(found.fun) > MIN_DRIVE_GAIN else known
+    late = DriveLag(*np.abs(found.x).tolist())
+    matters = cost(np.array(known)) - float(found.fun) > MIN_DRIVE_GAIN and sum(late) > max(MIN_DRIVE_S, 1.0 / rate)
+    return late if matters else known
 
 
 def fit_recording(problem: AxisRegression, noise: AxisNoise, slow: float) -> AxisFit:
