@@ -212,11 +212,11 @@ def test_a_late_change_in_a_longer_recording(learned: Learned) -> None:
 
 @pytest.mark.parametrize("learned", ["axis", "cylinder"], indirect=True)
 def test_half_the_rate(learned: Learned) -> None:
-    """u changes between two samples of such a log; the loop file of the rig says that it does not."""
+    """u changes between two samples of such a log, of which the rig's exact predictor knows nothing."""
     machine = learned.machine
 
     def thinned(recording: ss.Recording) -> ss.Recording:
         return replace(recording[::2], sample_rate=0.5 * machine.rate)
 
     diagnoses = learned.judge_changed(thinned, machine.loop(1.0, 0.5 * machine.rate))
-    check(learned, diagnoses, SHARE * machine.seconds, sized(learned, 0.03))
+    check(learned, diagnoses, SHARE * machine.seconds, sized(learned, 0.05))  # reversals lie between samples
