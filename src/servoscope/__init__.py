@@ -27,6 +27,7 @@ __all__ = [
     "__version__",
     "design_study",
     "diagnose",
+    "init",
     "inspect",
     "learn",
     "plot",
@@ -47,8 +48,10 @@ if TYPE_CHECKING:
     from servoscope.diagnosis.operating_points import learn
     from servoscope.diagnosis.result import Diagnosis
     from servoscope.learning.inspection import inspect
+    from servoscope.learning.proposal import init
     from servoscope.models.loop import Columns, Loop
     from servoscope.report.diagnosis_page import write_report
+    from servoscope.report.plots import picture_html as picture_html
     from servoscope.report.plots import plot
     from servoscope.signals.readers import read, read_parts
     from servoscope.signals.recording import Recording
@@ -66,8 +69,10 @@ else:  # hidden from type checkers, which would otherwise accept any name
         "Trace": "detection.trace",
         "design_study": "design",
         "diagnose": "diagnosis.diagnose",
+        "init": "learning.proposal",
         "inspect": "learning.inspection",
         "learn": "diagnosis.operating_points",
+        "picture_html": "report.plots",  # not in __all__: of `Diagnosis` in a notebook
         "plot": "report.plots",
         "read": "signals.readers",
         "read_parts": "signals.readers",
@@ -85,4 +90,4 @@ else:  # hidden from type checkers, which would otherwise accept any name
         return found
 
     def __dir__() -> list[str]:
-        return sorted({*globals(), *__all__})
+        return sorted({*__all__, "NoveltyDetector"})

@@ -102,7 +102,10 @@ def diagnose(
     [('viscous_friction', 1.25)]
     """
     learned = Baseline.of(baseline)
-    return _diagnose_at_point(learned, as_recording(recording, learned.loop), progress, point)[0]
+    judged = as_recording(recording, learned.loop)
+    diagnosis = _diagnose_at_point(learned, judged, progress, point)[0]
+    vars(diagnosis)["made_of"] = learned, judged  # what its report shows
+    return diagnosis
 
 
 @with_one_blas_thread

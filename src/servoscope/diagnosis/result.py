@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import computed_field, model_validator
 
+from servoscope.core.errors import OutputError, RecordingError
 from servoscope.core.messages import (
     Message,
     MessageField,
     MessageText,
     clock_of,
+    format_moment,
     message,
     read_messages,
     render,
     text_message,
+    translate,
 )
+from servoscope.core.public import public_name
 from servoscope.core.short_repr import ShortRepr
+from servoscope.diagnosis.dates import date_headline
 from servoscope.isolation.candidate import Candidate, FaultEstimate, ResultModel
 from servoscope.signals import Defect, Recording
 
 Verdict = Literal["healthy", "fault", "undetermined"]
-MAX_ALIKE = 3  # defects of one kind that are shown one by one
-DEFECT_KINDS = ("gap", "nan", "repeat", "spike", "order", "text", "saturation")
+MAX_LINES = 10  # that `print` shows
 VIBRATION = "vibration"  # a fault that moves no parameter: what is left of the motion is louder
 
 
@@ -124,21 +128,6 @@ class DiagnosisWarning(ResultModel):
             count=defect.count,
             description=text_message(defect.message),
         )
-
-
-def sum_up(warnings: Sequence[DiagnosisWarning]) -> list[DiagnosisWarning]:
-    """Return warnings, defects of a kind that came more than MAX_ALIKE times as one."""
-    kinds = Counter(warning.kind for warning in warnings if warning.kind in DEFECT_KINDS)
-    summed: dict[str, DiagnosisWarning] = {}
-    for number, warning in enumerate(warnings):
-        if kinds[warning.kind] <= MAX_ALIKE:
-            summed[str(number)] = warning
-        elif warning.kind not in summed:
-            alike = [each for each in warnings if each.kind == warning.kind]
-            text = message("diagnosis.alike", first=warning.description, times=len(alike))
-            count, to_s = sum(each.count for each in alike), max(each.to_s for each in alike)
-            summed[warning.kind] = warning.model_copy(update={"description": text, "count": count, "to_s": to_s})
-    return list(summed.values())
 
 
 class FaultInterval(ResultModel):
@@ -244,7 +233,12 @@ class Diagnosis(ShortRepr, ResultModel):
         return self.intervals[-1] if self.intervals else FaultInterval()
 
     def _shown_facts(self) -> dict[str, object]:
-        return {"recording": self.recording, "verdict": self.verdict, "summary": self.summary}
+        facts: dict[str, object] = {"recording": self.recording, "verdict": self.verdict, "summary": self.summary}
+        sizes = [
+            f"{fault.name} {fault.ratio:.4g} ({fault.interval[0]:.4g} to {fault.interval[1]:.4g})"
+            for fault in self.faults
+        ]
+        return {**facts, **({"size": "; ".join(sizes)} if sizes else {})}
 
     @computed_field  # type: ignore[prop-decorator]
     @property
@@ -300,39 +294,101 @@ class Diagnosis(ShortRepr, ResultModel):
 
         `onset`: of a change that is older than the recording, where it is known [UTC s].
         """
-        if self.headline.key == "diagnosis.timeline":
-            return _dated_timeline(self.headline, began)
-        since = self.headline.values.get("since")
-        if self.current.onset_s is None or not isinstance(since, Message):
-            return self.headline
-        if self.current.from_start and onset is None:
-            since = message("diagnosis.since_start_date", t=began)
-        else:
-            at = began + self.current.onset_s[1] if onset is None else onset
-            since = message("diagnosis.since_date", t=at, growth=since.values.get("growth"))
-        return self.headline.model_copy(update={"values": {**self.headline.values, "since": since}})
+        interval = self.current
+        begin = None if interval.onset_s is None else interval.onset_s[1]
+        return date_headline(self.headline, began, begin, onset, from_start=interval.from_start)
 
+    def _shown_lines(self) -> list[str]:
+        """Return what `print` shows: at most ten lines."""
+        dates = "" if self.began is None else f", {render(message('cli.dates', zone=self.zone or 'local'))}"
+        lines = [
+            f"{self.recording}: {self.duration_s:.6g} s, {self.samples} {translate('samples')}{dates}",
+            self.summary,
+        ]
+        facts = [("what to check", str(check)) for check in self.checks[:2]]
+        with clock_of(self.began):
+            if self.onset_s is not None:
+                low, likely, high = self.onset_s
+                facts.append(("onset", f"{format_moment(likely)} ({low:.4g} to {high:.4g} s, 95 %)"))
+            if self.detected_at_s is not None:
+                facts.append(("detected", format_moment(self.detected_at_s)))
+        if self.faults and self.probability is not None:
+            facts.append(
+                (
+                    "how sure",
+                    render(
+                        message("diagnosis.candidate", names=[self.candidates[0].name], probability=self.probability)
+                    ),
+                )
+            )
+        facts += [("why", reason) for reason in self.explanation[:1]]
+        lines += [f"  {translate(name)}: {text}" for name, text in facts]
+        if self.warnings:
+            lines.append(f"  {translate('warnings')}: {len(self.warnings)}")
+        return lines[:MAX_LINES]
 
-DATED = {  # parts of the headline of a timeline: in seconds, and as dates
-    "diagnosis.healed": "diagnosis.healed_date",
-    "diagnosis.stretch_when": "diagnosis.stretch_when_date",
-    "diagnosis.stretch_since": "diagnosis.stretch_since_date",
-    "diagnosis.stretch_until": "diagnosis.stretch_until_date",
-    "diagnosis.stretch_start": "diagnosis.stretch_start_date",
-}
+    def __str__(self) -> str:
+        return "\n".join(self._shown_lines())
 
+    def plot(self, backend: Literal["matplotlib", "plotly"] = "matplotlib") -> Any:
+        """Draw the coefficients over their healthy values, as `servoscope.plot` does.
 
-def _dated_timeline(headline: Message, began: float) -> Message:
-    """Return the headline of a timeline with dates instead of seconds since `began` [UTC s]."""
+        Examples
+        --------
+        >>> (axes,) = ss.diagnose("baseline.json", "friday.csv").plot()
+        >>> axes.get_title()
+        'friday.csv: fault'
+        """
+        return public_name("plot")(self, backend)
 
-    def dated(given: Message) -> Message:
-        times = {name: began + given.values[name] for name in ("t", "from_s", "to_s") if given.values.get(name)}
-        return message(DATED[given.key], began=began, **times)
+    def report(self, path: str | Path) -> None:
+        """Write the report on it as one HTML page, as `servoscope.write_report` does.
 
-    stretches = tuple(
-        one.model_copy(update={"values": {**one.values, "when": dated(one.values["when"])}})
-        for one in headline.values["stretches"]
-    )
-    now = headline.values["now"]
-    values = {**headline.values, "stretches": stretches, "now": None if now is None else dated(now)}
-    return headline.model_copy(update={"values": values})
+        Raises OutputError if the page cannot be written, or the diagnosis was read from a file.
+
+        Examples
+        --------
+        >>> ss.diagnose("baseline.json", "friday.csv").report("friday.html")
+        """
+        made_of = vars(self).get("made_of")  # no field: it is neither written nor compared
+        if made_of is None:
+            raise OutputError(
+                f"{path}: this diagnosis has no recording with it, use write_report(path, baseline, recording)"
+            )
+        public_name("write_report")(path, *made_of)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what `diagnose --json` prints, as a dictionary.
+
+        Examples
+        --------
+        >>> ss.diagnose("baseline.json", "friday.csv").to_dict()["faults"][0]["name"]
+        'viscous_friction'
+        """
+        return self.model_dump(mode="json")
+
+    def to_frame(self) -> Any:
+        """Return a frame of pandas: one row per fault of each interval, with its size, onset and probability.
+
+        Raises RecordingError if pandas is not installed.
+
+        Examples
+        --------
+        >>> list(ss.diagnose("baseline.json", "friday.csv").to_frame()["fault"])
+        ['viscous_friction']
+        """
+        try:
+            import pandas as pd
+        except ModuleNotFoundError:
+            raise RecordingError(f"{self.recording}: a frame needs pandas, pip install pandas") from None
+        return pd.DataFrame([self._row(interval, fault) for interval in self.intervals for fault in interval.faults])
+
+    def _row(self, interval: FaultInterval, fault: FaultEstimate) -> dict[str, Any]:
+        low, onset, high = interval.onset_s or (None, None, None)
+        row = {"recording": self.recording, "verdict": self.verdict, "fault": fault.name, "ratio": fault.ratio}
+        row |= {"ratio_low": fault.interval[0], "ratio_high": fault.interval[1], "probability": interval.probability}
+        return {**row, "onset_s": onset, "onset_low_s": low, "onset_high_s": high, "end_s": interval.end_s}
+
+    def _repr_html_(self) -> str:
+        """Return a table for notebooks, with what to check and a picture."""
+        return super()._repr_html_() + public_name("picture_html")(self)

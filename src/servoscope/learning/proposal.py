@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from servoscope.core import number_format
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import IrregularTimeError, LoopError, NotEnoughError, RecordingError, ServoscopeError
+from servoscope.core.files import atomic_write
 from servoscope.core.messages import Message, message, render
 from servoscope.core.settings_errors import describe_error
 from servoscope.learning.inspection import Inspection, inspect
@@ -80,10 +81,18 @@ class LoopProposal:
     lines: tuple[ProposalLine, ...]
     candidates: tuple[PlantCandidate, ...]
     notes: tuple[Message, ...]
+    origin: str = ""  # the log that it was made from
 
-    def to_toml(self, origin: str) -> str:
+    def __str__(self) -> str:
+        return self.to_toml()
+
+    def save(self, path: str | Path) -> None:
+        """Write the loop file with the reasons as comments; raises OutputError if that fails."""
+        atomic_write(Path(path), self.to_toml().encode())
+
+    def to_toml(self, origin: str = "") -> str:
         """Return the loop file with comments; `origin`: the log that it was made from."""
-        written = [f"# {render(message('init.origin', log=origin))}"]
+        written = [f"# {render(message('init.origin', log=origin or self.origin))}"]
         section = ""
         for line in self.lines:
             if line.section != section:
@@ -227,6 +236,38 @@ def _covariate_notes(path: Path, columns: Columns) -> list[Message]:
         and channel.min < channel.max
     ]
     return [message("init.covariates", names=names)] if names else []
+
+
+def init(
+    path: str | Path | Sequence[str | Path], columns: str | None = None, *, where: Mapping[str, str] | None = None
+) -> LoopProposal:
+    """Propose a loop from logs: columns, units, sample rate, plant, cutoff and memory, each with its evidence.
+
+    Parameters
+    ----------
+    path
+        The log, or several of one machine.
+    columns
+        What is known of columns, as ``"u=cur"``; the others are guessed by the words and units in their names.
+    where
+        Rows to take, as for `read`.
+
+    Returns
+    -------
+    LoopProposal
+        ``.loop``, ``.lines`` with the reasons, ``.candidates``, ``.notes``; `print` shows the loop file, ``.save(path)``
+        writes it.
+
+    Raises RecordingError if the log cannot be read, nothing moves in it, or no name suggests u or y.
+
+    Examples
+    --------
+    >>> ss.init("monday.csv").loop.sample_rate
+    200.0
+    """
+    paths = [Path(path)] if isinstance(path, str | Path) else [Path(log) for log in path]
+    proposal = propose_loop(paths, propose_columns(paths[0], list_channels(paths[0]), given=columns), where)
+    return replace(proposal, origin=paths[0].name)
 
 
 def propose(path: str | Path | Sequence[str | Path], columns: Columns | None = None) -> tuple[LoopProposal, Inspection]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from rich.console import Console
@@ -10,14 +11,16 @@ from rich.padding import Padding
 from rich.text import Text
 
 from servoscope.cli.render.results import COLOURS, INDENT, print_facts, print_notes, print_table, print_title
-from servoscope.core.messages import clock_of, format_moment, translate, translate_range
+from servoscope.core.messages import clock_of, format_moment, message, translate, translate_range
 from servoscope.core.number_format import format_ratios, format_short
-from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, FaultInterval, RefitSummary, sum_up
+from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, FaultInterval, RefitSummary
 from servoscope.isolation.candidate import Candidate
 from servoscope.report.format_values import format_duration, format_probability
 from servoscope.report.page import say
 
 MAX_WARNINGS = 12
+MAX_ALIKE = 3  # defects of one kind that are shown one by one
+DEFECT_KINDS = ("gap", "nan", "repeat", "spike", "order", "text", "saturation")
 # probability below which a candidate has no line; the explanation says why it was rejected
 MIN_PROBABILITY_SHOWN = 0.01
 
@@ -104,7 +107,7 @@ def _print_candidates(out: Console, shown: Sequence[Candidate]) -> None:
 
 def _print_warnings(out: Console, warnings: Sequence[DiagnosisWarning]) -> None:
     texts = []
-    for w in sum_up(warnings):
+    for w in _sum_up(warnings):
         when = f"{w.from_s:.6g} s" if w.from_s == w.to_s else translate_range(f"{w.from_s:.6g} to {w.to_s:.6g} s")
         # What the recording can show at all is no matter of time.
         texts.append(str(w.message) if w.kind == "power" else f"{when}: {w.message}")
@@ -112,3 +115,18 @@ def _print_warnings(out: Console, warnings: Sequence[DiagnosisWarning]) -> None:
     if more > 1:
         texts[MAX_WARNINGS:] = [say("cli.more_warnings", count=more)]
     print_notes(out, texts)
+
+
+def _sum_up(warnings: Sequence[DiagnosisWarning]) -> list[DiagnosisWarning]:
+    """Return warnings, defects of a kind that came more than MAX_ALIKE times as one."""
+    kinds = Counter(warning.kind for warning in warnings if warning.kind in DEFECT_KINDS)
+    summed: dict[str, DiagnosisWarning] = {}
+    for number, warning in enumerate(warnings):
+        if kinds[warning.kind] <= MAX_ALIKE:
+            summed[str(number)] = warning
+        elif warning.kind not in summed:
+            alike = [each for each in warnings if each.kind == warning.kind]
+            text = message("diagnosis.alike", first=warning.description, times=len(alike))
+            count, to_s = sum(each.count for each in alike), max(each.to_s for each in alike)
+            summed[warning.kind] = warning.model_copy(update={"description": text, "count": count, "to_s": to_s})
+    return list(summed.values())
