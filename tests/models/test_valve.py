@@ -146,7 +146,7 @@ def test_on_a_rig_with_friction_valve_and_warm_oil_it_sizes_a_leak_and_stands_a_
 
     half, leaking = recorded(2, 0.5), recorded(3, faults=(FaultEvent("leakage", 1.2, 30.0),))
     linear, curved = (learn(loop_of(rig, law, delay=0.0128), [recorded(1)]) for law in ("linear", "square-root"))
-    assert curved.recursion.R < 0.4 * linear.R
+    assert curved.recursion.R < 0.4 * linear.recursion.R
     assert diagnose(curved, half).verdict == "healthy"
     (found,) = diagnose(curved, leaking).faults
     assert found.parameter == "C_ie"

@@ -34,6 +34,7 @@ RUN = (
     "README.md",
     "tutorial.md",
     "from-matlab.md",
+    "how-to/hydraulic-cylinder.md",
     "how-to/python.md",
     "how-to/trend.md",
 )  # their Python is run, below
@@ -100,6 +101,11 @@ def test_the_page_of_trends(tmp_path: Path) -> None:
     names: dict[str, Any] = {}
     assert run_page(DOCS / "how-to" / "trend.md", tmp_path, names) == 1
     assert names["found"].remaining_s is not None
+
+
+@pytest.mark.slow
+def test_the_page_of_the_cylinder(tmp_path: Path) -> None:
+    assert run_page(DOCS / "how-to" / "hydraulic-cylinder.md", tmp_path) == 3
 
 
 @pytest.mark.slow

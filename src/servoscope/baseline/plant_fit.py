@@ -199,5 +199,5 @@ def fault_directions(
             return nominal_theta(loop, plant.scaled({parameter: ratio}))
 
         return {p: (at(np.exp(step), p) - at(np.exp(-step), p)) / (2.0 * step) for p in parameters}
-    names = plant.names
-    return {p: np.where(np.array(names) == p, theta, 0.0) if p in names else np.array(theta) for p in parameters}
+    moved = {p: plant.exponents(p) for p in parameters}
+    return {p: np.array([powers.get(name, 0.0) for name in plant.names]) * theta for p, powers in moved.items()}

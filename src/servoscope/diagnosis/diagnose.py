@@ -99,7 +99,7 @@ def diagnose(
     >>> diagnose("baseline.json", "wednesday.csv").verdict
     'healthy'
     >>> [(fault.name, round(fault.ratio, 2)) for fault in diagnose("baseline.json", "friday.csv").faults]
-    [('viscous_friction', 1.25)]
+    [('lubrication', 1.25)]
     """
     learned = Baseline.of(baseline)
     judged = as_recording(recording, learned.loop)

@@ -189,10 +189,10 @@ def _alarm_reason(exam: Examination, interval: FaultInterval) -> Message | None:
     first = min(int(np.searchsorted(exam.t(slice(None)), interval.detected_at_s)), exam.evaluations - 1)
     if exam.estimates.level[first] >= 1.0:
         return message("diagnosis.alarm_cusum", t=interval.detected_at_s)
-    value = float(exam.statistic[first])
-    return message(
-        "diagnosis.alarm_t2", t=interval.detected_at_s, value=value, limit=exam.baseline.thresholds.statistic
-    )
+    value, limit = float(exam.statistic[first]), exam.baseline.thresholds.statistic
+    if value <= limit and exam.change is not None:
+        return message("diagnosis.alarm_change", t=interval.detected_at_s)
+    return message("diagnosis.alarm_t2", t=interval.detected_at_s, value=value, limit=limit)
 
 
 def _distance_message(deviations: float, first: bool) -> Message:

@@ -190,9 +190,16 @@ class AxisSignals:
         return np.concatenate([slope(self.y[r]) for r in self.runs])
 
     def columns(self, plant: AxisPlant) -> FloatArray:
-        """Return u and minus what the terms multiply, shape (1 + n, N): times `acceleration_coefficients`, y''."""
+        """Return u and minus what the terms multiply, shape (1 + n, N): times `acceleration_coefficients`, y''.
+
+        Each is its mean from a sample to the next, as u is: held from the sample on, a friction that grows would be
+        half a sample late, and pass for inertia.
+        """
         v = np.where(np.abs(self.speed) > plant.sign_speed, self.speed, 0.0)
-        return np.array([self.u, *-plant.regressors(self.y, v)])
+        terms = plant.regressors(self.y, v)
+        following = np.append(np.arange(1, len(v)), len(v) - 1)
+        following[np.flatnonzero(self.restart[following])] -= 1  # a run ends with its own value
+        return np.array([self.u, *-0.5 * (terms + terms[:, following])])
 
     def moving(self, rest_speed: float, settling: int) -> BoolArray:
         """Return where the axis moves and the filter has forgotten the last rest, reversal and gap, shape (N,).

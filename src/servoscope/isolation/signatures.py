@@ -66,7 +66,12 @@ def _plant_signatures(
         return [parameter_signature(f, partial(shift, f.parameter)) for f in faults]
     directions = fault_directions(baseline.loop, plant, np.array(baseline.theta))
     moving = [fault for fault in plant.faults if np.any(directions[fault.parameter])]
-    single = [coefficient_signature(fault, learned @ directions[fault.parameter]) for fault in moving]
+    single = [
+        coefficient_signature(fault, learned @ directions[fault.parameter])
+        if {*plant.exponents(fault.parameter).values()} <= {1.0}
+        else parameter_signature(fault, _power_shift(baseline, plant.exponents(fault.parameter), learned))
+        for fault in moving
+    ]
     return single + [
         _ray_signature(ray, learned, directions, _healthy_std(baseline, ray.full[0][0])) for ray in plant.rays
     ]
@@ -91,6 +96,14 @@ def _ray_signature(
         return np.asarray(np.sum(parts, axis=0))
 
     return parameter_signature(ray.fault, shift, healthy_std)
+
+
+def _power_shift(
+    baseline: Baseline, exponents: Mapping[str, float], learned: FloatArray
+) -> Callable[[float], FloatArray]:
+    """Return how the coefficients move with powers of a parameter's ratio."""
+    theta, powers = np.array(baseline.theta), np.array([exponents.get(name, 0.0) for name in baseline.names])
+    return lambda ratio: np.asarray(learned @ (theta * (ratio**powers - 1.0)))
 
 
 def _simulated_shifts(baseline: Baseline, expectation: Expectation, onset: int) -> Shift:

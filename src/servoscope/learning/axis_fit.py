@@ -24,7 +24,7 @@ from servoscope.signals import Recording
 REST_SHARE = 0.03  # of the speed of motion (rms), below which the axis counts as resting
 MAX_FORCE_CORRELATION_S = 0.05  # correlation of the unexplained force: a slower one would take over what friction does
 SCATTER = 0.05  # standard deviation of a coefficient's logarithm between recordings, before any is compared
-SCATTER_DOF = 2.0  # recordings that this is worth
+SCATTER_DOF = 0.5  # recordings that this is worth: three that agree are believed more than it
 MIN_SCATTER = 0.01
 FORCE_OFFSET_SHARE = 0.05  # of the force (rms), by which the constant one may differ between recordings and within one
 MIN_COEFFICIENT_STDS = 3.0  # standard deviations from which a coefficient is seen
@@ -220,10 +220,10 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
     assert isinstance(plant, AxisPlant)
     signals = [axis_signals(loop, one, stride) for one in recordings]
     slow = rest_speed(signals)
-    check_motion(recordings, signals, slow, 1 + len(plant.columns))
+    check_motion(recordings, signals, slow, 1 + len(plant.acting))
     drive, noise, problems = _fit_drive_and_noise(loop, recordings, stride, slow)
     fits = [fit_recording(one, noise, slow) for one in problems]
-    names = ("inertia", *(column.coefficient for column in plant.columns))
+    names = ("inertia", *(column.coefficient for column in plant.acting))
     center, of_center = combine_fits(fits, len(names))
     # in physical units, linear around the common coefficients: u alone may hardly show in a recording
     J = _physical_slope(center, plant)
@@ -232,7 +232,7 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
     covariances = np.array([J @ one.covariance[: len(names), : len(names)] @ J.T for one in fits])
     stds = np.sqrt(np.array([np.diag(one) for one in covariances]))
     known = [
-        i for i, name in enumerate(names) if name == "inertia" or not plant.columns[i - 1].signed or name == "gravity"
+        i for i, name in enumerate(names) if name == "inertia" or not plant.acting[i - 1].signed or name == "gravity"
     ]
     seen = mean / np.sqrt(np.diag(J @ of_center @ J.T))  # of all recordings together
     unseen = [i for i in known if seen[i] < MIN_COEFFICIENT_STDS and names[i] != "gravity"]

@@ -1,8 +1,8 @@
-"""Which plant explains u: polynomials in s and motor axes, judged by rows that they were not fitted to."""
+"""Which plant explains u: polynomials in s, motor axes and cylinders, judged by rows that they were not fitted to."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -15,7 +15,8 @@ from servoscope.core.errors import NotEnoughError
 from servoscope.learning.inspection import model_order, signals
 from servoscope.learning.inspection.inspect import motion_mask
 from servoscope.models.loop import Loop, MonitorSettings
-from servoscope.models.plants.axis import TERMS, AxisPlant
+from servoscope.models.plants import cylinder, parse_plant
+from servoscope.models.plants.axis import TERMS
 from servoscope.signals import Recording
 
 MIN_FOLDS = 6  # of which each is left out once: a recording, or a piece of one
@@ -32,6 +33,7 @@ MIN_ANGLE_RAD = 0.02  # off 0, from which it is said where a weight hangs
 MIN_ANGLE_STDS = 3.0
 AXIS_POWERS = "stiffness", "viscous_friction", "inertia"
 AXIS_TERMS = "stiffness", "viscous_by_direction", "coulomb", "stribeck", "offset"
+CONTACT_SHARES = np.linspace(0.2, 0.9, 8)  # of the range of y, at which a process force may begin
 SWING_TERMS = "gravity", "load_friction", "cogging"  # a cogging of period 2 pi tells where the weight hangs
 
 
@@ -52,12 +54,12 @@ class PlantCandidate:
 
     @property
     def words(self) -> str:
-        """Return the terms of an axis, or what the polynomial is made of."""
+        """Return the terms of an axis or a cylinder, or what the polynomial is made of."""
         s = self.settings
-        if s["kind"] == "axis":
+        if "terms" in s:
             terms = s["terms"]
             assert isinstance(terms, list)
-            return f"axis: {', '.join(terms)}"
+            return f"{s['kind']}: {', '.join(terms)}"
         parts = [f"order {s['order']}", *["stiffness"] * bool(s["stiffness"]), *["coulomb"] * (s["friction"] != "none")]
         return f"polynomial: {', '.join(parts)}"
 
@@ -115,6 +117,11 @@ def choose_plant(
     of_higher_order = [plant for plant in _polynomials(powers) if plant[0]["order"] > 2 - is_speed]
     plants += [(*plant, of_generic) for plant in of_higher_order]
     candidates = [candidate for plant in plants if (candidate := _judge(*plant)) is not None]
+    if not is_speed:
+        low, high = (pick([pick(recording.y) for recording in recordings]) for pick in (np.min, np.max))
+        most = max((candidate.explained for candidate in candidates), default=0.0)
+        contacts = [float(f"{low + share * (high - low):.3g}") for share in CONTACT_SHARES]
+        candidates += _judge_cylinders(lambda plant: folds(_loop(rate, cutoff, plant)), most, contacts)
     plausible = [candidate for candidate in candidates if candidate.plausible]
     if not plausible:
         raise NotEnoughError("it moves too little to compare plants: record a livelier or longer motion")
@@ -143,7 +150,7 @@ def _simplicity(candidate: PlantCandidate, swings: bool) -> tuple[int, bool, boo
     Faults of an axis have names and its refit; what a spring holds without friction is a linear system of order 2.
     """
     settings = candidate.settings
-    terms, polynomial = settings.get("terms", []), settings["kind"] == "polynomial"
+    terms, polynomial = settings.get("terms", []), "terms" not in settings
     assert isinstance(terms, list)
     spring = "stiffness" in terms or settings.get("stiffness") is True
     rubs = "coulomb" in terms or settings.get("friction") == "coulomb"
@@ -159,7 +166,28 @@ def _rich_axis(axis: Mapping[str, object], swings: bool, hanging_at: float) -> d
 def _loop(rate: float, cutoff: float, plant: Mapping[str, object]) -> Loop:
     sign = {"sign_cutoff": min(model_order.FAST_SIGN, rate / 4.0)}
     monitor = MonitorSettings(cutoff=cutoff, evaluation_rate=min(10.0, rate), frequencies=(rate / 10.0,))
-    return Loop(name="axis", sample_rate=rate, plant=AxisPlant.model_validate({**plant, **sign}), monitor=monitor)
+    return Loop(name="compared", sample_rate=rate, plant=parse_plant({**plant, **sign}), monitor=monitor)
+
+
+def _judge_cylinders(
+    folds: Callable[[Mapping[str, object]], list[_Fold]], explained: float, contacts: Sequence[float]
+) -> list[PlantCandidate]:
+    """Return cylinders on which a spring acts; with a process force too, if that explains more than the others do.
+
+    Without a load that takes its part of the pressure, a cylinder is as good as an axis.
+    """
+    judged: list[PlantCandidate] = []
+    for contact in (None, *contacts):
+        more = {} if contact is None else {"contact": contact}
+        loads = ("spring",) if contact is None else ("spring", "process")
+        made = folds({"kind": "cylinder", "terms": [*loads, "overlap", "offset"], **more})
+        for chosen in (list(loads), [*loads, "overlap"]):
+            names = ("acceleration", *cylinder.BY_DIRECTION, *(cylinder.TERMS[term].coefficient for term in chosen))
+            candidate = _judge({"kind": "cylinder", "terms": [*chosen, "offset"], **more}, names, made)
+            judged += [] if candidate is None else [candidate]
+        if max((candidate.explained for candidate in judged), default=0.0) <= explained:
+            break
+    return judged
 
 
 def _axes(
@@ -192,7 +220,6 @@ def _polynomials(names: Sequence[str]) -> Iterator[tuple[dict[str, Any], tuple[s
 
 def _judge(settings: dict[str, object], names: tuple[str, ...], folds: Sequence[_Fold]) -> PlantCandidate | None:
     """Fit a plant to all folds but one, predict that one; None where there are too few rows."""
-    axis = settings["kind"] == "axis"
     made = [fold.matrix(names) for fold in folds]
     if sum(map(len, made)) < MIN_ROWS_PER_COLUMN * len(names):
         return None
@@ -212,8 +239,13 @@ def _judge(settings: dict[str, object], names: tuple[str, ...], folds: Sequence[
         squares.append(np.add.reduceat(left**2, fold.blocks) / whole)
     together = np.concatenate(squares)
     theta = dict(zip(names, solve(A, c), strict=True))
-    signed = {column.coefficient for columns in TERMS.values() for column in columns if column.signed}
-    plausible = not axis or all(value > 0.0 for name, value in theta.items() if name not in signed)
+    every = [
+        *(column for columns in TERMS.values() for column in columns),
+        cylinder.ACCELERATION,
+        *cylinder.TERMS.values(),
+    ]
+    signed = {column.coefficient for column in every if column.signed}
+    plausible = "terms" not in settings or all(value > 0.0 for name, value in theta.items() if name not in signed)
     return PlantCandidate(settings, 1.0 - float(together.sum()), together, len(names), plausible)
 
 

@@ -14,13 +14,15 @@ from servoscope.learning.inspection.rules import MIN_EXPLAINED_SHARE
 from servoscope.signals import Recording
 from servoscope.signals.readers.wrap import find_wrap
 
-# of a motor axis: what turns motion into force can have no other sign; stiffness and offset can, as gravity does
+# what turns motion into force or flow can have no other sign; stiffness and offset can, as gravity does
 POSITIVE_COEFFICIENTS = (
     "inertia",
     "viscous_friction",
     "viscous_friction_forward",
     "viscous_friction_backward",
     "coulomb_friction",
+    "velocity_forward",
+    "velocity_backward",
 )
 MAX_NEGATIVE_STDS = 3.0  # standard deviations below 0
 MAX_NEGATIVE_SHARE = 0.1  # share of u (rms) that a negative coefficient carries, which no scatter excuses

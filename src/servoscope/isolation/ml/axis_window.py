@@ -150,7 +150,7 @@ class AxisWindow(ChangeWindow):
         assert plant.coefficients is not None
         each = plant.acceleration_coefficients()
         # what grows with y as measured does so through its gain already
-        degrees = np.array([0, *(column.degree for column in plant.columns)])
+        degrees = np.array([0, *(column.degree for column in plant.acting)])
         each = np.where(degrees == 0, output_gain, 1.0) * each
         return np.concatenate([each, output_gain * np.asarray(added) / plant.coefficients["inertia"]])
 

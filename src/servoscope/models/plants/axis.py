@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from servoscope.core.arrays import FloatArray
-from servoscope.models.plants.base import SIGN_CUTOFF, CoefficientPlant, Fault, StateSpace, read_translations
+from servoscope.models.plants.base import SIGN_CUTOFF, Fault, read_translations
 from servoscope.models.plants.columns import COLUMN_FORMS, Column
+from servoscope.models.plants.terms import TermColumn, TermPlant
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 NOT_DUMPED = Field(exclude_if=lambda value: value in (None, "position"))  # hashes of loops without it stay as they were
@@ -29,33 +29,23 @@ TermName = Literal[
 ]
 
 
-@dataclass(frozen=True)
-class AxisColumn:
-    """One coefficient of a term and what it multiplies."""
-
-    coefficient: str
-    column: int | Column  # power of s, or a function of position and speed
-    degree: int = 0  # 1 where it grows with y or y' in proportion
-    signed: bool = False  # whether the coefficient may be negative
-
-
-TERMS: dict[str, tuple[AxisColumn, ...]] = {
-    "stiffness": (AxisColumn("stiffness", 0, 1),),
-    "viscous": (AxisColumn("viscous_friction", 1, 1),),
+TERMS: dict[str, tuple[TermColumn, ...]] = {
+    "stiffness": (TermColumn("stiffness", 0, 1),),
+    "viscous": (TermColumn("viscous_friction", 1, 1),),
     "viscous_by_direction": (
-        AxisColumn("viscous_friction_forward", Column.FORWARD, 1),
-        AxisColumn("viscous_friction_backward", Column.BACKWARD, 1),
+        TermColumn("viscous_friction_forward", Column.FORWARD, 1),
+        TermColumn("viscous_friction_backward", Column.BACKWARD, 1),
     ),
-    "coulomb": (AxisColumn("coulomb_friction", Column.SIGN),),
+    "coulomb": (TermColumn("coulomb_friction", Column.SIGN),),
     # Stribeck's fall of friction with speed by Hess and Soom (1990), which needs no exponential
-    "stribeck": (AxisColumn("stribeck_friction", Column.STRIBECK),),
-    "offset": (AxisColumn("offset", Column.CONSTANT, signed=True),),
-    "gravity": (AxisColumn("gravity", Column.SINE, signed=True),),
+    "stribeck": (TermColumn("stribeck_friction", Column.STRIBECK),),
+    "offset": (TermColumn("offset", Column.CONSTANT, signed=True),),
+    "gravity": (TermColumn("gravity", Column.SINE, signed=True),),
     # friction of a gear in proportion to the weight that it carries (Bittencourt and Gunnarsson, 2012)
-    "load_friction": (AxisColumn("load_friction", Column.LOAD),),
+    "load_friction": (TermColumn("load_friction", Column.LOAD),),
     "cogging": (
-        AxisColumn("cogging_sin", Column.COGGING_SIN, signed=True),
-        AxisColumn("cogging_cos", Column.COGGING_COS, signed=True),
+        TermColumn("cogging_sin", Column.COGGING_SIN, signed=True),
+        TermColumn("cogging_cos", Column.COGGING_COS, signed=True),
     ),
 }
 """What may act on an axis besides its inertia, by the name that a loop file declares."""
@@ -115,7 +105,7 @@ def _as_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value  # TOML has lists, and plants are read strictly
 
 
-class AxisPlant(CoefficientPlant):
+class AxisPlant(TermPlant):
     """Motor axis ``input_gain u = inertia y'' + sum of terms``, each a coefficient times a function of y and y'.
 
     Where y is a speed, y' and y'' are y itself and its derivative.
@@ -177,33 +167,16 @@ class AxisPlant(CoefficientPlant):
         return self
 
     @property
-    def columns(self) -> tuple[AxisColumn, ...]:
-        """The columns of all terms, powers of s first."""
+    def columns(self) -> tuple[TermColumn, ...]:
+        """The columns of all terms and of the inertia, powers of s first."""
         each = [column for term in TERMS if term in self.terms for column in TERMS[term]]
-        return tuple(sorted(each, key=lambda column: isinstance(column.column, Column)))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Coefficients of the powers, inertia last among them, then the others."""
-        linear = [column.coefficient for column in self.columns if isinstance(column.column, int)]
-        others = [column.coefficient for column in self.columns if isinstance(column.column, Column)]
-        return (*linear, "inertia", *others)
-
-    @property
-    def powers(self) -> tuple[int, ...]:
-        """Powers of s: those of the terms, and 2; one less where y is a speed."""
-        powers = (*(column.column for column in self.columns if isinstance(column.column, int)), 2)
-        return tuple(power - self.derivative for power in powers)
+        powers = [column for column in each if isinstance(column.column, int)]
+        return (*powers, TermColumn("inertia", 2, 1), *(column for column in each if column not in powers))
 
     @property
     def derivative(self) -> int:
         """The power of s by which y is ahead of a position."""
         return int(self.y == "speed")
-
-    @property
-    def extras(self) -> tuple[Column, ...]:
-        """Columns of the other terms."""
-        return tuple(column.column for column in self.columns if isinstance(column.column, Column))
 
     @property
     def column_shapes(self) -> Mapping[Column, tuple[float, float]]:
@@ -217,9 +190,14 @@ class AxisPlant(CoefficientPlant):
             Column.COGGING_COS: (wave_number, 0.5 * np.pi),
         }
 
+    @property
+    def acting(self) -> tuple[TermColumn, ...]:
+        """All columns but that of the inertia, as the refit takes them."""
+        return tuple(column for column in self.columns if column.coefficient != "inertia")
+
     def regressors(self, y: FloatArray, v: FloatArray) -> FloatArray:
-        """Return what the coefficients of `columns` multiply, shape (columns, N), of y and y', shapes (N,)."""
-        columns, shapes = [term.column for term in self.columns], self.column_shapes
+        """Return what the coefficients of `acting` multiply, shape (columns, N), of y and y', shapes (N,)."""
+        columns, shapes = [term.column for term in self.acting], self.column_shapes
         return np.array(
             [
                 COLUMN_FORMS[column].values(y, v, *shapes.get(column, ()))
@@ -262,17 +240,22 @@ class AxisPlant(CoefficientPlant):
         own = self._nominal()["inertia"] / self.payload_arm**2 if self.payload_mass is None else self.payload_mass
         return (ratio - 1.0) * own
 
+    def exponents(self, parameter: str) -> Mapping[str, float]:
+        """Return the powers by coefficient; friction that differs by direction changes in both."""
+        if parameter == "viscous_friction" and "viscous_by_direction" in self.terms:
+            return dict.fromkeys(BY_DIRECTION, 1.0)
+        if parameter == "moved_mass":
+            return dict.fromkeys(("inertia", "gravity", "load_friction"), 1.0)
+        return super().exponents(parameter)
+
     def scaled(self, factors: Mapping[str, Any]) -> Self:
         """Return the same axis with coefficients multiplied; ``input_gain`` multiplies all of them."""
-        factors = dict(factors)
-        common, both = factors.pop("input_gain", 1.0), factors.pop("viscous_friction", 1.0)
-        for name in BY_DIRECTION if "viscous_by_direction" in self.terms else ("viscous_friction",):
-            factors[name] = factors.get(name, 1.0) * both
-        mass = factors.pop("moved_mass", None)
-        scaled = {name: value * common * factors.get(name, 1.0) for name, value in self._nominal().items()}
+        mass = factors.get("moved_mass")
+        moved = super().scaled({name: factor for name, factor in factors.items() if name != "moved_mass"})
         if mass is not None:
-            self._load(scaled, (mass - 1.0) * self._unit_inertia() * common)
-        return self.model_copy(update={"coefficients": scaled})
+            assert moved.coefficients is not None
+            self._load(moved.coefficients, (mass - 1.0) * self._unit_inertia() * factors.get("input_gain", 1.0))
+        return moved
 
     def _unit_inertia(self) -> float:
         """Return the inertia that a ratio of 1 more stands for: the axis's own, or that of the mass that it carries."""
@@ -294,17 +277,8 @@ class AxisPlant(CoefficientPlant):
             coefficients["load_friction"] *= 1.0 + weight / own
 
     def acceleration_coefficients(self) -> Any:
-        """Return b and all a_i of ``y'' = b u - sum a_i column_i``, in the order of `columns`; they may be complex."""
+        """Return b and all a_i of ``y'' = b u - sum a_i column_i``, in the order of `acting`; they may be complex."""
         nominal = self._nominal()
-        each = [self.input_gain, *(nominal[column.coefficient] for column in self.columns)]
-        return np.array(each) / nominal["inertia"]
-
-    def state_space(self) -> StateSpace:
-        """Continuous linear part: position and speed, or speed alone; friction by direction enters with its mean."""
-        nominal = self._nominal()
-        viscous = nominal.get("viscous_friction", 0.5 * sum(nominal.get(name, 0.0) for name in BY_DIRECTION))
-        inertia = nominal["inertia"]
-        if self.derivative:
-            return np.array([[-viscous / inertia]]), np.array([[self.input_gain / inertia]]), np.ones((1, 1))
-        A = np.array([[0.0, 1.0], [-nominal.get("stiffness", 0.0) / inertia, -viscous / inertia]])
-        return A, np.array([[0.0], [self.input_gain / inertia]]), np.array([[1.0, 0.0]])
+        return (
+            np.array([self.input_gain, *(nominal[column.coefficient] for column in self.acting)]) / nominal["inertia"]
+        )

@@ -221,6 +221,13 @@ class Plant(BaseModel, abc.ABC):
         """
         return {}
 
+    def exponents(self, parameter: str) -> Mapping[str, float]:
+        """Return, by coefficient, the power of a parameter's ratio with which it goes.
+
+        So it is where the coefficients are all that is known of a plant.
+        """
+        return {parameter: 1.0} if parameter in self.names else dict.fromkeys(self.names, 1.0)
+
     def expand_rays(self, factors: Mapping[str, Any]) -> dict[str, Any]:
         """Return factors by parameter, in which those of rays have become those of what they move."""
         expanded = dict(factors)

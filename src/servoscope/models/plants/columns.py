@@ -1,4 +1,4 @@
-"""Columns of the regression beyond the powers of s: friction, a constant, sines of the position."""
+"""Columns of the regression beyond the powers of s: friction, a constant, sines of the position, loads of a valve."""
 
 from __future__ import annotations
 
@@ -24,6 +24,10 @@ class Column(StrEnum):
     COGGING_SIN = "cogging_sin"  # the same
     COGGING_COS = "cogging_cos"  # the same
     LOAD = "load_v"  # |sin(factor y + phase)| sign(y')
+    SPEED = "abs_v"  # |y'|
+    SPEED_POSITION = "abs_v_y"  # |y'| y
+    SPEED_BEYOND = "abs_v_beyond"  # |y'| where y is beyond the factor, 0 elsewhere
+    SPEED_SQUARED = "v_abs_v"  # y' |y'|
 
 
 class ColumnForm(NamedTuple):
@@ -62,4 +66,12 @@ COLUMN_FORMS = {
         lambda y, v, a, b: np.abs(np.sin(a * y + b)) * np.sign(v),
         True,
     ),
+    Column.SPEED: ColumnForm(lambda y, v, dead: abs(v), lambda y, v: np.abs(v)),
+    Column.SPEED_POSITION: ColumnForm(lambda y, v, dead: abs(v) * y, lambda y, v: np.abs(v) * y),
+    Column.SPEED_BEYOND: ColumnForm(
+        lambda y, v, dead, a, b: where(y > a, abs(v), 0.0),
+        lambda y, v, a, b: np.where(y > a, np.abs(v), 0.0),
+        True,
+    ),
+    Column.SPEED_SQUARED: ColumnForm(lambda y, v, dead: abs(v) * v, lambda y, v: np.abs(v) * v),
 }

@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
-import numpy as np
 from pydantic import Field, model_validator
 
-from servoscope.models.plants.base import (
-    SIGN_CUTOFF,
-    CoefficientPlant,
-    Fault,
-    StateSpace,
-    matrices,
-    read_translations,
-)
+from servoscope.models.plants.base import SIGN_CUTOFF, Fault, read_translations
 from servoscope.models.plants.columns import Column
+from servoscope.models.plants.terms import TermColumn, TermPlant
 
 POWER_NAMES = ("stiffness", "viscous_friction", "inertia", "jerk", "snap")
 EXTRA_NAMES = {
@@ -47,7 +40,7 @@ FrictionKind = Literal["none", "coulomb", "directional"]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class PolynomialPlant(CoefficientPlant):
+class PolynomialPlant(TermPlant):
     """Plant whose inverse is a polynomial in s, plus Coulomb friction, friction per direction and a constant."""
 
     translations: ClassVar[Mapping[str, Mapping[str, str]]] = read_translations(__file__)
@@ -94,20 +87,16 @@ class PolynomialPlant(CoefficientPlant):
         return (POWER_NAMES[self.order],)
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Stiffness, viscous friction, inertia, jerk, snap as far as present, then the extras."""
-        return tuple(POWER_NAMES[power] for power in self.powers) + tuple(EXTRA_NAMES[extra] for extra in self.extras)
+    def columns(self) -> tuple[TermColumn, ...]:
+        """Stiffness, viscous friction, inertia, jerk, snap as far as present, then friction, sign and constant.
 
-    @property
-    def powers(self) -> tuple[int, ...]:
-        """Powers of s up to the order; without 1 where the viscous friction goes by direction."""
+        The power 1 is missing where the viscous friction goes by direction.
+        """
         first = 0 if self.stiffness else 1
-        return tuple(p for p in range(first, self.order + 1) if p != 1 or self.friction != "directional")
-
-    @property
-    def extras(self) -> tuple[Column, ...]:
-        """Friction by direction, sign and constant as far as present."""
-        return (*FRICTION_COLUMNS[self.friction], *((Column.CONSTANT,) if self.offset else ()))
+        powers = [p for p in range(first, self.order + 1) if p != 1 or self.friction != "directional"]
+        extras = (*FRICTION_COLUMNS[self.friction], *((Column.CONSTANT,) if self.offset else ()))
+        named = [TermColumn(POWER_NAMES[power], power, 1) for power in powers]
+        return *named, *(TermColumn(EXTRA_NAMES[extra], extra) for extra in extras)
 
     @property
     def unwatched(self) -> tuple[str, ...]:
@@ -125,32 +114,3 @@ class PolynomialPlant(CoefficientPlant):
         """One per coefficient, and the input gain, which scales them all."""
         words = {name: name.replace("_", " ") for name in self.names} | {"input_gain": INPUT_GAIN_WORDS}
         return tuple(self._fault(name, name, text, CHECKS.get(name, "")) for name, text in words.items())
-
-    def scaled(self, factors: Mapping[str, Any]) -> Self:
-        """Return the same plant with coefficients multiplied; ``input_gain`` multiplies all of them.
-
-        A factor of the input gain above 1 means that the same motion asks for more u.
-        """
-        common = factors.get("input_gain", 1.0)
-        scaled = {name: value * common * factors.get(name, 1.0) for name, value in self._nominal().items()}
-        return self.model_copy(update={"coefficients": scaled})
-
-    def state_space(self) -> StateSpace:
-        """Continuous linear part: A (n, n), B (n, 1), C (1, n), n the order; states y and its derivatives.
-
-        Friction by direction enters with the mean of both directions; sign and offset are left out.
-        """
-        A, B, C = self.state_spaces({}, 1)
-        return A[0], B[0], C[0]
-
-    def state_spaces(self, factors: Mapping[str, Any], count: int) -> StateSpace:
-        """Return those of so many plants at once: their coefficients are arrays."""
-        nominal = dict(self.scaled(factors)._nominal())
-        if self.friction == "directional":
-            nominal["viscous_friction"] = 0.5 * (
-                nominal["viscous_friction_forward"] + nominal["viscous_friction_backward"]
-            )
-        polynomial = [nominal.get(POWER_NAMES[power], 0.0) for power in range(self.order + 1)]
-        A = [*np.eye(self.order, k=1)[:-1].tolist(), [-each / polynomial[-1] for each in polynomial[:-1]]]
-        B = [[0.0]] * (self.order - 1) + [[self.input_gain / polynomial[-1]]]
-        return matrices(A, count), matrices(B, count), matrices(np.eye(1, self.order).tolist(), count)

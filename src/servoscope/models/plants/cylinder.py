@@ -1,0 +1,189 @@
+"""A hydraulic cylinder behind a valve, without data sheet: what u asks for at each speed, position and load."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from servoscope.models.plants.base import SIGN_CUTOFF, Fault, read_translations
+from servoscope.models.plants.columns import Column
+from servoscope.models.plants.terms import TermColumn, TermPlant
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+TermName = Literal["jerk", "spring", "process", "droop", "overlap", "leakage", "offset"]
+
+BY_DIRECTION = "velocity_forward", "velocity_backward"
+ACCELERATION = TermColumn("acceleration", 2, 1, signed=True)
+# term -> its column; the velocity by direction, for two areas, and the acceleration are part of every cylinder
+TERMS: dict[str, TermColumn] = {
+    "leakage": TermColumn("leakage", 0, 1, signed=True),
+    "jerk": TermColumn("jerk", 3, 1, signed=True),
+    # the root of the pressure that a spring leaves to the valve, to first order in the load
+    "spring": TermColumn("spring", Column.SPEED_POSITION, 2, signed=True),
+    # the same of a force beyond a position
+    "process": TermColumn("process", Column.SPEED_BEYOND, 1, signed=True),
+    # of a supply that gives way to the flow
+    "droop": TermColumn("droop", Column.SPEED_SQUARED, 2, signed=True),
+    "overlap": TermColumn("overlap", Column.SIGN),
+    "offset": TermColumn("offset", Column.CONSTANT, signed=True),
+}
+"""What moves u besides the velocity, by the name that a loop file declares, in the order of the coefficients."""
+
+SUPPLY = {
+    **dict.fromkeys((*BY_DIRECTION, "acceleration", "jerk", "leakage"), -0.5),
+    **dict.fromkeys(("spring", "process", "droop"), -1.5),
+}
+EXPONENTS: dict[str, dict[str, float]] = {
+    "supply_pressure": SUPPLY,
+    "gain_forward": {"velocity_forward": -1.0, "spring": -0.5, "process": -0.5},
+    "gain_backward": {"velocity_backward": -1.0, "spring": -0.5, "process": -0.5},
+    "load": dict.fromkeys(BY_DIRECTION, 1.0),
+}
+"""Parameters that move several coefficients; the flow through an edge is g x sqrt(p_S - p_load) (Merritt, 1967)."""
+
+VALVE_CHECKS = "valve: contamination, worn edges, amplifier; its flow at a given pressure drop"
+# parameter -> name of the fault, range that is searched, what it means, what to check
+FAULTS: dict[str, tuple[str, tuple[float, float], str, str]] = {
+    "supply_pressure": (
+        "supply",
+        (0.3, 2.0),
+        "another supply pressure",
+        "pump, relief valve, filter and accumulator: pressure at rest and in motion",
+    ),
+    "gain_forward": ("valve_forward", (0.3, 3.0), "another flow of the valve forward", VALVE_CHECKS),
+    "gain_backward": ("valve_backward", (0.3, 3.0), "another flow of the valve backward", VALVE_CHECKS),
+    "load": (
+        "friction",
+        (0.5, 3.0),
+        "more u for the same speed, whatever the load: friction",
+        "rod seal, guide and bearing: alignment, lubrication, side load",
+    ),
+    "leakage": (
+        "leakage",
+        (0.05, 20.0),
+        "more u to hold a load: leakage of piston or valve",
+        "piston seal and valve edges: warm cylinder, drift under load with the valve shut, oil return flow",
+    ),
+    "overlap": (
+        "overlap",
+        (0.1, 20.0),
+        "more u before anything moves: overlap of the valve, hysteresis, static friction",
+        "valve: worn edges, its zero, contamination; amplifier: dead band",
+    ),
+    "acceleration": (
+        "lag",
+        (0.05, 20.0),
+        "u comes late: a slow spool, a heavier load",
+        "valve: pilot pressure, contamination, amplifier; mass that is moved",
+    ),
+    "jerk": ("air", (0.05, 20.0), "softer oil: air", "oil: air in it, foam, water, age; oil level and suction line"),
+    "offset": (
+        "zero",
+        (0.1, 10.0),
+        "more u at rest: zero of the valve, another load at rest",
+        "valve: zero and its amplifier; a load that hangs",
+    ),
+    "process": (
+        "process_force",
+        (0.1, 10.0),
+        "another process force, which is no fault of the cylinder",
+        "process: product, tool, material",
+    ),
+}
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value  # TOML has lists, and plants are read strictly
+
+
+class CylinderPlant(TermPlant):
+    """Cylinder ``input_gain u = c_forward max(y', 0) + c_backward min(y', 0) + acceleration y'' + sum of terms``.
+
+    ::
+
+        u = v/(g sqrt(p_S - p_load)),   p_load = (k y + F)/A sign(v)      orifice flow, to first order in the load
+          = c v + spring abs(v) y + process abs(v) [y > contact] + overlap sign(v) + ... + offset
+    """
+
+    EXPONENTS: ClassVar[Mapping[str, Mapping[str, float]]] = EXPONENTS
+    translations: ClassVar[Mapping[str, Mapping[str, str]]] = read_translations(__file__)
+
+    kind: Literal["cylinder"] = "cylinder"
+    terms: Annotated[tuple[TermName, ...], BeforeValidator(_as_tuple)] = (
+        "spring",
+        "overlap",
+        "offset",
+    )
+    # output beyond which the force of the term ``process`` acts
+    contact: Finite | None = None
+    # speed [output per s] below which sign(y') is not trusted and set to 0
+    sign_speed: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
+    # where the sign of the recursion comes from: the measured output, or the reference where y is noisy or slow
+    sign_from: Literal["output", "reference"] = "output"
+    # cutoff [Hz] of the differentiator behind the sign
+    sign_cutoff: Positive = SIGN_CUTOFF
+    # values by name, all of `names`, as `learn` finds them
+    coefficients: dict[str, Finite] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if len(set(self.terms)) < len(self.terms):
+            raise ValueError("terms: one stands twice, remove it")
+        if ("process" in self.terms) != (self.contact is not None):
+            raise ValueError("contact: belongs to the term process, give both or none of them")
+        if self.coefficients is not None and set(self.coefficients) != set(self.names):
+            wrong = ", ".join(sorted(set(self.coefficients) ^ set(self.names)))
+            raise ValueError(f"coefficients: give each of {', '.join(self.names)}; check {wrong}")
+        return self
+
+    @property
+    def has_physics(self) -> bool:
+        """The columns say what u a motion asks for, and nothing of the motion that u makes."""
+        return False
+
+    @property
+    def columns(self) -> tuple[TermColumn, ...]:
+        """Powers of s, the velocity by direction, and the other terms."""
+        chosen = [column for term, column in TERMS.items() if term in self.terms]
+        directions = TermColumn(BY_DIRECTION[0], Column.FORWARD, 1), TermColumn(BY_DIRECTION[1], Column.BACKWARD, 1)
+        powers = {column.column: column for column in (*chosen, ACCELERATION) if isinstance(column.column, int)}
+        others = [column for column in chosen if column.column not in powers]
+        return *(powers[power] for power in sorted(powers)), *directions, *others
+
+    @property
+    def column_shapes(self) -> Mapping[Column, tuple[float, float]]:
+        """Where the process force begins."""
+        return {Column.SPEED_BEYOND: (self.contact or 0.0, 0.0)}
+
+    @property
+    def coefficient_units(self) -> tuple[str, ...]:
+        """Units of the coefficients."""
+        of_u = "u" if self.input_gain == 1.0 else "input_gain u"
+        units = {0: f"{of_u}/y", 2: f"{of_u} s²/y", 3: f"{of_u} s³/y"}
+        extras = {
+            Column.SPEED_POSITION: f"{of_u} s/y²",
+            Column.SPEED_SQUARED: f"{of_u} s²/y²",
+            Column.SIGN: of_u,
+            Column.CONSTANT: of_u,
+        }
+        return tuple(
+            units[column.column] if isinstance(column.column, int) else extras.get(column.column, f"{of_u} s/y")
+            for column in self.columns
+        )
+
+    @property
+    def unwatched(self) -> tuple[str, ...]:
+        """What no term shows."""
+        return ("backlash", *(() if "overlap" in self.terms else ("coulomb_friction",)))
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """Changes that are told by name, as far as the terms show them."""
+        return tuple(
+            Fault(name, parameter, range_, words, checks)
+            for parameter, (name, range_, words, checks) in FAULTS.items()
+            if parameter in EXPONENTS or parameter in self.names
+        )

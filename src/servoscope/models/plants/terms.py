@@ -1,0 +1,96 @@
+"""Plants that are lists of terms: ``input_gain u = sum of coefficient x column(y, y', y'', ...)``."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from servoscope.models.plants.base import CoefficientPlant, StateSpace, matrices
+from servoscope.models.plants.columns import Column
+
+
+@dataclass(frozen=True)
+class TermColumn:
+    """One coefficient of a term and what it multiplies."""
+
+    coefficient: str
+    column: int | Column  # power of s, or a function of y and y'
+    degree: int = 0  # 1 where it grows with y or y' in proportion
+    signed: bool = False  # whether the coefficient may be negative
+
+
+class TermPlant(CoefficientPlant):
+    """Plant whose coefficients each multiply one column; its parameters multiply one or several coefficients."""
+
+    # the parameters that move several coefficients: by parameter, the power of its ratio with which each goes
+    EXPONENTS: ClassVar[Mapping[str, Mapping[str, float]]] = {}
+
+    @property
+    @abc.abstractmethod
+    def columns(self) -> tuple[TermColumn, ...]:
+        """All columns, powers of s first and in order."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Coefficients of the powers, then the others."""
+        return tuple(column.coefficient for column in self.columns)
+
+    @property
+    def powers(self) -> tuple[int, ...]:
+        """Powers of s; one less where y is a speed."""
+        return tuple(column.column - self.derivative for column in self.columns if isinstance(column.column, int))
+
+    @property
+    def extras(self) -> tuple[Column, ...]:
+        """Columns of the other terms."""
+        return tuple(column.column for column in self.columns if isinstance(column.column, Column))
+
+    def exponents(self, parameter: str) -> Mapping[str, float]:
+        """Return, by coefficient, the power of the parameter's ratio with which it goes."""
+        if parameter == "input_gain":
+            return dict.fromkeys(self.names, 1.0)
+        known = self.EXPONENTS.get(parameter, {parameter: 1.0})
+        return {name: power for name, power in known.items() if name in self.names}
+
+    def scaled(self, factors: Mapping[str, Any]) -> Self:
+        """Return the same plant with what its parameters move; ``input_gain`` multiplies all coefficients.
+
+        A factor of the input gain above 1 means that the same motion asks for more u.
+        """
+        moved = {name: value * factors.get("input_gain", 1.0) for name, value in self._nominal().items()}
+        for parameter, factor in factors.items():
+            if parameter != "input_gain":
+                for name, power in self.exponents(parameter).items():
+                    moved[name] = moved[name] * (factor if power == 1.0 else factor**power)
+        return self.model_copy(update={"coefficients": moved})
+
+    def _polynomial(self) -> list[Any]:
+        """Return the coefficients of all powers of s from 0 on; friction by direction enters with its mean."""
+        nominal = self._nominal()
+        polynomial: list[Any] = [0.0] * (1 + max([1 - self.derivative, *self.powers]))
+        for column in self.columns:
+            if isinstance(column.column, int):
+                polynomial[column.column - self.derivative] = nominal[column.coefficient]
+            elif column.column in (Column.FORWARD, Column.BACKWARD):
+                polynomial[1 - self.derivative] = polynomial[1 - self.derivative] + 0.5 * nominal[column.coefficient]
+        return polynomial
+
+    def state_space(self) -> StateSpace:
+        """Continuous linear part: A (n, n), B (n, 1), C (1, n), n the order; states y and its derivatives.
+
+        Friction by direction enters with the mean of both directions; all other columns are left out.
+        """
+        A, B, C = self.state_spaces({}, 1)
+        return A[0], B[0], C[0]
+
+    def state_spaces(self, factors: Mapping[str, Any], count: int) -> StateSpace:
+        """Return those of so many plants at once: their coefficients are arrays."""
+        *lower, leading = self.scaled(factors)._polynomial()
+        n = len(lower)
+        A = [*np.eye(n, k=1)[:-1].tolist(), [-value / leading for value in lower]]
+        B = [[0.0]] * (n - 1) + [[self.input_gain / leading]]
+        return matrices(A, count), matrices(B, count), matrices(np.eye(1, n).tolist(), count)
