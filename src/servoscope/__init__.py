@@ -51,7 +51,6 @@ if TYPE_CHECKING:
     from servoscope.learning.proposal import init
     from servoscope.models.loop import Columns, Loop
     from servoscope.report.diagnosis_page import write_report
-    from servoscope.report.plots import picture_html as picture_html
     from servoscope.report.plots import plot
     from servoscope.signals.readers import read, read_parts
     from servoscope.signals.recording import Recording
@@ -72,7 +71,6 @@ else:  # hidden from type checkers, which would otherwise accept any name
         "init": "learning.proposal",
         "inspect": "learning.inspection",
         "learn": "diagnosis.operating_points",
-        "picture_html": "report.plots",  # not in __all__: of `Diagnosis` in a notebook
         "plot": "report.plots",
         "read": "signals.readers",
         "read_parts": "signals.readers",

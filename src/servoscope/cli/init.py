@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from servoscope.models.loop import Columns
 
 MAX_LISTED_PLANTS = 6
+PART_ROWS = 1_000_000  # of each log that are looked at
 
 
 @app.command()
@@ -44,11 +45,13 @@ def init(
     from servoscope.report.page import say
     from servoscope.signals import readers
     from servoscope.signals.readers.axes import find_axes
+    from servoscope.signals.readers.table import read_part
 
     log, asks = logs[0], not yes and sys.stdin.isatty() and sys.stdout.isatty()
     reader = arguments.RecordingReader.from_options(None, reading)
     out = results.create_console()
-    channels = readers.list_channels(log, reader.text)
+    with read_part(PART_ROWS):
+        channels = readers.list_channels(log, reader.text)
     if asks and reading.columns is None:
         results.print_channels(out, log, channels)
     axes = [reading.axis] if reading.axis is not None or reading.columns is not None else []
@@ -74,7 +77,10 @@ def init(
                 chosen = propose_columns(log, channels, axis, typer.prompt(say("init.ask_columns")))
             assert chosen is not None, "it was proposed, or asked for"
             changes = {"text": reader.text or chosen.text, "resample": reading.resample or chosen.resample}
-            _propose(out, logs, chosen.model_copy(update=changes), target, asks, reader.where)
+            with read_part(PART_ROWS) as part:
+                _propose(out, logs, chosen.model_copy(update=changes), target, asks, reader.where)
+            cut = [say("init.part", log=name, rows=count) for name, count in part.cut.items()]
+            results.print_notes(out, cut, "blue", "-")
     failures.exit_if_any()
 
 

@@ -103,9 +103,7 @@ def diagnose(
     """
     learned = Baseline.of(baseline)
     judged = as_recording(recording, learned.loop)
-    diagnosis = _diagnose_at_point(learned, judged, progress, point)[0]
-    vars(diagnosis)["made_of"] = learned, judged  # what its report shows
-    return diagnosis
+    return _diagnose_at_point(learned, judged, progress, point)[0].made_of(learned, judged)
 
 
 @with_one_blas_thread

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from pydantic import computed_field, model_validator
 
@@ -21,7 +21,7 @@ from servoscope.core.messages import (
     text_message,
     translate,
 )
-from servoscope.core.public import public_name
+from servoscope.core.public import picture_html, public_name
 from servoscope.core.short_repr import ShortRepr
 from servoscope.diagnosis.dates import date_headline
 from servoscope.isolation.candidate import Candidate, FaultEstimate, ResultModel
@@ -330,6 +330,11 @@ class Diagnosis(ShortRepr, ResultModel):
     def __str__(self) -> str:
         return "\n".join(self._shown_lines())
 
+    def made_of(self, baseline: object, recording: Recording) -> Self:
+        """Keep what its report shows; no field: it is neither written nor compared."""
+        vars(self)["_made_of"] = baseline, recording
+        return self
+
     def plot(self, backend: Literal["matplotlib", "plotly"] = "matplotlib") -> Any:
         """Draw the coefficients over their healthy values, as `servoscope.plot` does.
 
@@ -350,7 +355,7 @@ class Diagnosis(ShortRepr, ResultModel):
         --------
         >>> ss.diagnose("baseline.json", "friday.csv").report("friday.html")
         """
-        made_of = vars(self).get("made_of")  # no field: it is neither written nor compared
+        made_of = vars(self).get("_made_of")
         if made_of is None:
             raise OutputError(
                 f"{path}: this diagnosis has no recording with it, use write_report(path, baseline, recording)"
@@ -391,4 +396,4 @@ class Diagnosis(ShortRepr, ResultModel):
 
     def _repr_html_(self) -> str:
         """Return a table for notebooks, with what to check and a picture."""
-        return super()._repr_html_() + public_name("picture_html")(self)
+        return super()._repr_html_() + (picture_html(self) if self.parameters else "")

@@ -120,7 +120,9 @@ def propose_columns(
             raise RecordingError(f"{path}: no axis {axis!r}, {has}")
         names = axes[axis]
     told = parse_fields(given) if given else {}
-    used = " ".join(str(value) for value in told.values())  # a column that the user names is no other signal
+    texts = [str(text) for value in told.values() for text in (value if isinstance(value, tuple) else (value,))]
+    # a column that the user names is no other signal
+    used = {*texts, *(word for text in texts for pair in re.findall(r"`([^`]+)`|([\w.]+)", text) for word in pair)}
     fields = {**guess_mapping([name for name in names if name not in used]), **told}
     missing = [letter for letter in "uy" if fields[FIELDS[letter]] is None]
     if missing:
@@ -255,7 +257,7 @@ def init(
     Returns
     -------
     LoopProposal
-        ``.loop``, ``.lines`` with the reasons, ``.candidates``, ``.notes``; `print` shows the loop file, ``.save(path)``
+        ``.loop``, ``.lines`` with reasons, ``.candidates``, ``.notes``; `print` shows the loop file, ``.save(path)``
         writes it.
 
     Raises RecordingError if the log cannot be read, nothing moves in it, or no name suggests u or y.

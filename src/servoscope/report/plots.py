@@ -5,8 +5,6 @@ What a picture shows is data, a `Picture`, which matplotlib or plotly draws.
 
 from __future__ import annotations
 
-import base64
-import io
 from dataclasses import dataclass
 from functools import singledispatch
 from typing import TYPE_CHECKING, Any, Literal, overload
@@ -28,7 +26,6 @@ if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
 Z95 = 1.959963984540054  # a normal value is within so many standard deviations in 95 %
-PICTURE_DPI = 60
 Thing = Recording | Trace | Baseline | Inspection | Diagnosis
 
 
@@ -101,18 +98,6 @@ def plot(thing: Thing, backend: Literal["matplotlib", "plotly"] = "matplotlib") 
     if backend not in drawings:
         raise ValueError(f"backend is 'matplotlib' or 'plotly', not {backend!r}")
     return drawings[backend](_picture(thing))
-
-
-def picture_html(thing: Thing) -> str:
-    """Return what `plot` draws as an image for a notebook's table; nothing where there is nothing to draw."""
-    import matplotlib.pyplot as plt
-
-    if isinstance(thing, Diagnosis) and not thing.parameters:
-        return ""
-    file, figure = io.BytesIO(), plot(thing)[0].figure
-    figure.savefig(file, format="png", dpi=PICTURE_DPI)
-    plt.close(figure)
-    return f'<img alt="plot" src="data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}">'
 
 
 def _draw_matplotlib(picture: Picture) -> tuple[Axes, ...]:
