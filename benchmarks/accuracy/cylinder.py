@@ -1,6 +1,6 @@
 """Faults of a hydraulic cylinder, found and named, beside simple detectors.
 
-    python benchmarks/accuracy/cylinder.py [--mixed] [--json]
+    python benchmarks/accuracy/cylinder.py [--mixed] [--first SEED] [--json]
 
 Seven healthy production days are learned, or ten of mixed motions; 32 further healthy days, sixty faults and six
 changes of the process force are judged. Days, faults and sizes: `cylinder_days.py`.
@@ -20,6 +20,8 @@ from tables import Table, parser, show
 import servoscope as ss
 from accuracy.cylinder_days import (
     FAULTS,
+    HEALTHY,
+    LEARNED,
     MIXED,
     MIXED_HEALTHY,
     RATE,
@@ -31,6 +33,7 @@ from accuracy.cylinder_days import (
 )
 
 WINDOW_S, CUTOFF_HZ = 10.0, 10.0
+MEMORY_S = 15.0  # two cycles of production
 PLANTS: dict[str, dict[str, object]] = {
     "linear": {"kind": "polynomial", "order": 2, "offset": True},
     "cylinder": {"kind": "cylinder", "terms": ["spring", "process", "overlap", "offset"], "contact": 0.06},
@@ -53,7 +56,7 @@ NAMES: dict[str, set[str]] = {
 
 def loop(plant: dict[str, object]) -> ss.Loop:
     """Return the loop file of the cylinder."""
-    monitor = {"cutoff": CUTOFF_HZ, "frequencies": [0.5, 2.0]}
+    monitor = {"cutoff": CUTOFF_HZ, "memory": MEMORY_S, "frequencies": [0.5, 2.0]}
     # a linear plant has a negative inertia here, which `learn` would refuse
     settings = {"name": "cylinder", "sample_rate": RATE, "implausible": "note", "plant": plant, "monitor": monitor}
     return ss.Loop.from_dict(settings)
@@ -79,9 +82,12 @@ def main() -> None:
     command = parser(__doc__)
     command.add_argument("--mixed", action="store_true", help="learn from ten days of mixed motions")
     command.add_argument("--plant", choices=PLANTS, help="judge with this plant alone")
+    command.add_argument("--first", type=int, default=0, help="added to all seeds")
     given = command.parse_args()
-    healthy = learned_days(MIXED) if given.mixed else learned_days()
-    days = [*healthy_days(MIXED_HEALTHY if given.mixed else ("production",) * 32), *faulty_days(), *process_days()]
+    first = given.first
+    kinds = (MIXED, MIXED_HEALTHY) if given.mixed else (("production",) * LEARNED, ("production",) * HEALTHY)
+    healthy = learned_days(kinds[0], first)
+    days = [*healthy_days(kinds[1], first), *faulty_days(first), *process_days(first)]
     judged = [day.recording for day in days]
     scores = [judge(one, healthy, judged) for one in detectors(WINDOW_S, CUTOFF_HZ)]
     simple = [[x > one.limit for x in one.largest] for one in scores]

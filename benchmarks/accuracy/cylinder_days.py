@@ -52,29 +52,29 @@ def day(kind: str, seed: int, parameters: tuple[str, ...] = (), ratio: float = 1
     return replace(recording, name=f"{kind} {seed}")
 
 
-def learned_days(kinds: tuple[str, ...] = ("production",) * LEARNED) -> list[ss.Recording]:
-    """Return the healthy days to learn from."""
-    return [day(kind, seed) for seed, kind in enumerate(kinds)]
+def learned_days(kinds: tuple[str, ...] = ("production",) * LEARNED, first: int = 0) -> list[ss.Recording]:
+    """Return the healthy days to learn from; `first`: added to all seeds."""
+    return [day(kind, first + seed) for seed, kind in enumerate(kinds)]
 
 
-def healthy_days(kinds: tuple[str, ...] = ("production",) * HEALTHY) -> list[Day]:
+def healthy_days(kinds: tuple[str, ...] = ("production",) * HEALTHY, first: int = 0) -> list[Day]:
     """Return further healthy days."""
-    return [Day(day(kind, 100 + seed)) for seed, kind in enumerate(kinds)]
+    return [Day(day(kind, first + 100 + seed)) for seed, kind in enumerate(kinds)]
 
 
-def faulty_days() -> Iterator[Day]:
+def faulty_days(first: int = 0) -> Iterator[Day]:
     """Yield the sixty faults: ten kinds, three sizes, from the start and from mid-recording."""
-    seed = 1000
+    seed = first + 1000
     for fault, (parameters, sizes) in FAULTS.items():
         for size in sizes:
             yield from _both(fault, parameters, size, seed)
             seed += 2
 
 
-def process_days() -> Iterator[Day]:
+def process_days(first: int = 0) -> Iterator[Day]:
     """Yield the six changes of the process force."""
     for k, size in enumerate(PROCESS):
-        yield from _both("process", ("process_force",), size, 2000 + 2 * k)
+        yield from _both("process", ("process_force",), size, first + 2000 + 2 * k)
 
 
 def _both(fault: str, parameters: tuple[str, ...], size: float, seed: int) -> Iterator[Day]:

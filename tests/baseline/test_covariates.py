@@ -213,7 +213,7 @@ def test_averages_hold_what_was_known_last() -> None:
 
 def test_who_carries_no_covariates_refuses_them(carried: ss.Baseline, tmp_path: Path) -> None:
     with pytest.raises(BaselineError, match="knows no covariates"):
-        ExportConstants.of(carried)
+        ExportConstants.from_baseline(carried)
     carried.save(tmp_path / "baseline.json")
     hall = (
         'name = "hall"\n[sources.line]\nkind = "opcua"\nurl = "opc.tcp://localhost"\n'

@@ -140,7 +140,7 @@ def test_what_cannot_be_told_apart_is_said(baseline: ss.Baseline) -> None:
 
 def test_who_cannot_carry_it_says_so(baseline: ss.Baseline, tmp_path: Path) -> None:
     with pytest.raises(BaselineError, match="an exported monitor knows no covariates"):
-        ExportConstants.of(baseline)
+        ExportConstants.from_baseline(baseline)
     with pytest.raises(LoopError, match="leave it out beside"):
         ss.Loop.from_dict({**LOOP.to_dict(), "columns": {"covariates": {"oil": "T_oil"}}})
     still = [simulate(PLAIN, reference("profile", 60.0, 100.0), seed=i)[0] for i in range(2)]

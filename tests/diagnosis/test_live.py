@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 from servoscope.core.errors import AlarmError, ConfigError, RecordingError, StateError
 from servoscope.core.messages import text_message
-from servoscope.diagnosis.follower import DiagnosisSchedule
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.diagnosis.result import Verdict
+from servoscope.diagnosis.schedule import DiagnosisSchedule
 from servoscope.service.alarms import AlarmSettings, LifecycleEvent, LifecycleState, OperatorCommand
 from servoscope.service.assets import checkpoint
 from servoscope.service.assets.asset import Asset, AssetPolicy

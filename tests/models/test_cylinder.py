@@ -9,6 +9,7 @@ import pydantic
 import pytest
 
 import servoscope as ss
+from servoscope.core.errors import LoopError
 from servoscope.learning.plant_choice import choose_plant
 from servoscope.models.plants import parse_plant
 from servoscope.models.plants.cylinder import CylinderPlant
@@ -59,6 +60,10 @@ class TestPlant:
         np.testing.assert_allclose(worn, [1.0, 1.25, 1.0, 0.8**-0.5, 1.0, 1.0])
         assert {fault.name for fault in plant.faults} >= {"supply", "valve_forward", "overlap", "lag", "friction"}
         assert "leakage" not in {fault.name for fault in plant.faults}  # no term shows it
+
+    def test_it_is_not_simulated_from_its_coefficients(self) -> None:
+        with pytest.raises(LoopError, match="simulate_cylinder"):
+            CylinderPlant(coefficients=COEFFICIENTS).state_space()
 
     @pytest.mark.parametrize(
         ("settings", "words"),

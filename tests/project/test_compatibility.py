@@ -30,6 +30,8 @@ ADDED = {
         "headline",
         "reasons",
         "intervals",
+        "began",
+        "zone",
         "description",
         "sensors",
         "provenance",

@@ -17,9 +17,11 @@ from servoscope.models.lti import (
     sample_system,
     settling_samples,
     state_variable_filter,
+    stretched_filter,
     tapped_delay_line,
 )
 from servoscope.models.plants import SIGN_CUTOFF, Column, Plant
+from servoscope.simulation.measurement import FeedForward
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +122,13 @@ def closed_loop_system(loop: Loop, plant: Plant) -> LinearSystem:
     if np.abs(np.linalg.eigvals(both[:, : n + 1])).max() >= 1.0:
         raise LoopError(f"{loop.name}: the closed loop is unstable, check [plant] and [controller]")
     outputs = np.vstack([u, y])
-    return LinearSystem(both[:, : n + 1], both[:, n + 1 :], outputs[:, : n + 1], outputs[:, n + 1 :])
+    loop_itself = LinearSystem(both[:, : n + 1], both[:, n + 1 :], outputs[:, : n + 1], outputs[:, n + 1 :])
+    if not loop.controller.k_v:
+        return loop_itself
+    feed = FeedForward(loop)
+    ahead = stretched_filter(feed.numerator, feed.denominator, 1)
+    plain = LinearSystem(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.eye(1))
+    return block_diagonal([ahead, plain, plain]).then(loop_itself)
 
 
 def instrument_system(loop: Loop) -> LinearSystem:

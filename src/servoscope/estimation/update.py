@@ -11,10 +11,11 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.jit import where
+from servoscope.core.jit.arrays import Variable
 from servoscope.core.jit.llvm_text import LlvmPrinter
 from servoscope.core.jit.memory import Memory, apply
 from servoscope.core.jit.native import address, native_function
-from servoscope.core.jit.symbolic import Float, Int
+from servoscope.core.jit.symbolic import Float
 
 Numbers = list[Any]
 Matrix = list[Numbers]
@@ -76,8 +77,7 @@ def _compile_updates(estimator: ModuleType, n: int) -> Callable[..., int]:
     arguments = (*((name, "ptr") for name in ARRAYS), ("R", "double"), ("memory", "double"), ("samples", "i64"))
     p = LlvmPrinter(arguments, "i64")
     R, memory = (Float(p, f"%{name}", "double") for name in ("R", "memory"))
-    refused = p.stack("i64", 1)
-    p.store("i64", "0", refused)
+    refused = Variable(p, 0)
 
     def step(theta: Any, P: Any, P_d: Any, eta: Any, phi: Any, z: Any, K: Any, extra: Any) -> Any:
         signals = eta[0], [phi[i] for i in range(n)], [z[i] for i in range(n)]
@@ -92,7 +92,6 @@ def _compile_updates(estimator: ModuleType, n: int) -> Callable[..., int]:
     for k in p.loop(0, p.argument("samples")):
         memories = [Memory(p, f"%{name}", "double") for name in ARRAYS]
         memories[3:6] = memories[3].behind(k), memories[4].behind(k * n), memories[5].behind(k * n)
-        count = p.truncate(R * 0.0 + apply(step, *memories))
-        p.store("i64", str(Int(p, p.load("i64", refused)) + count), refused)
-    p.write(f"ret i64 {p.load('i64', refused)}")
+        refused.value = refused.value + p.truncate(R * 0.0 + apply(step, *memories))
+    p.write(f"ret i64 {refused.value}")
     return native_function(p.text(), arguments, "i64")

@@ -85,8 +85,8 @@ def export_c(
         If the baseline has something that cannot be exported; the message names it.
     """
     check_name(name)
-    made = ExportConstants.of(baseline, only_coefficients, single)
-    golden = GoldenRun.of(baseline, made.recursion, baseline.thresholds.statistic, made.delays)
+    made = ExportConstants.from_baseline(baseline, only_coefficients, single)
+    golden = GoldenRun.from_baseline(baseline, made.recursion, baseline.thresholds.statistic, made.delays)
     values = common_words(made, name) | _number_words(single) | _sizes(made, single) | _code(made, name, single)
     values |= _frozen_words(made)
     values["frozen_functions"] = fill_template("frozen.c", values)

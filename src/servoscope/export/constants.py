@@ -36,7 +36,9 @@ class ExportConstants:
     input_stage: str  # what the caller has to do to u beforehand; empty: nothing
 
     @classmethod
-    def of(cls, baseline: Baseline, only_coefficients: bool = False, single: bool = False) -> ExportConstants:
+    def from_baseline(
+        cls, baseline: Baseline, only_coefficients: bool = False, single: bool = False
+    ) -> ExportConstants:
         """Derive the constants of a baseline.
 
         With `only_coefficients`, what stands before the estimator and behind T^2 is left out: the stages that u goes

@@ -70,7 +70,9 @@ class GoldenRun:
     frozen: IntArray  # what is found to be frozen at each of them, 1 y, 2 u
 
     @classmethod
-    def of(cls, baseline: Baseline, recursion: Recursion, limit: float, delays: tuple[int, int]) -> GoldenRun:
+    def from_baseline(
+        cls, baseline: Baseline, recursion: Recursion, limit: float, delays: tuple[int, int]
+    ) -> GoldenRun:
         """Run a monitor over its golden samples."""
         c = recursion.constants[0]
         samples = int(np.clip(8 * c.wait + 20 * c.every, MIN_GOLDEN_SAMPLES, MAX_GOLDEN_SAMPLES))

@@ -21,8 +21,8 @@ def describe_rounding(made: ExportConstants, only_coefficients: bool, golden: Go
     T^2 and the sequential test are log-likelihoods: an error of d multiplies the rate of false alarms by exp(d/2), or
     by exp(d h) where d is in units of a CUSUM's limit h.
     """
-    double = ExportConstants.of(made.baseline, only_coefficients)
-    exact = GoldenRun.of(made.baseline, double.recursion, made.baseline.thresholds.statistic, made.delays)
+    double = ExportConstants.from_baseline(made.baseline, only_coefficients)
+    exact = GoldenRun.from_baseline(made.baseline, double.recursion, made.baseline.thresholds.statistic, made.delays)
     limit = made.baseline.thresholds.statistic
     near = exact.rows[:, 1] < 2.0 * limit  # far above it, nothing hangs on an error
     watch = double.recursion.constants[0].watch

@@ -41,7 +41,7 @@ def export_st(baseline: Baseline, name: str = NAME, *, only_coefficients: bool =
         If the baseline has something that cannot be exported; the message names it.
     """
     check_name(name)
-    made = ExportConstants.of(baseline, only_coefficients)
+    made = ExportConstants.from_baseline(baseline, only_coefficients)
     return fill_template("monitor.st", common_words(made, name) | _words(made))
 
 

@@ -22,8 +22,8 @@ from servoscope.detection.covariate_monitor import fill_channels
 from servoscope.detection.statistic import consecutive_exceedances
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.diagnose import diagnose_with_trace
-from servoscope.diagnosis.follower import DiagnosisSchedule
 from servoscope.diagnosis.monitor import Monitor
+from servoscope.diagnosis.schedule import DiagnosisSchedule
 from servoscope.fleet.common_cause import trace_evidence
 from servoscope.fleet.rows import MICRO, Rows
 from servoscope.signals.timebase import Timebase

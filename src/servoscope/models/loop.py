@@ -9,14 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    AfterValidator,
-    Field,
-    SerializeAsAny,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, SerializeAsAny, ValidationError, field_validator, model_validator
 
 from servoscope.core.errors import LoopError, ObsoleteSettingWarning
 from servoscope.core.settings import Finite, NonEmptyStr, NonNegative, Positive, Settings, parse_toml, read_toml_text
@@ -89,11 +82,13 @@ class Columns(Settings):
 
 
 class Controller(Settings):
-    """Discrete PI controller, u(k) = k_p e(k) + k_i T sum e, e = r - y."""
+    """Discrete PI controller with feed-forward, u(k) = k_p e(k) + k_i T sum e + k_v (r(k) - r(k-1))/T, e = r - y."""
 
     kind: Literal["pi"]
     k_p: Positive
     k_i: NonNegative
+    # feed-forward of the reference's speed; hashes of loops without it stay as they were
+    k_v: Annotated[NonNegative, Field(exclude_if=lambda value: value == 0.0)] = 0.0
 
 
 class MonitorSettings(Settings):

@@ -29,7 +29,6 @@ from servoscope.service.health import HealthReport
 from servoscope.service.housekeeping import Housekeeping
 from servoscope.service.log import log, set_level
 from servoscope.service.metrics import ServiceMetrics
-from servoscope.service.publishers.base import publisher_trouble
 from servoscope.service.reload import reload_components
 from servoscope.service.sources.block import Block
 from servoscope.service.sources.inbox import Inbox
@@ -328,7 +327,8 @@ class Service:
     @property
     def troubles(self) -> dict[str, str]:
         """What is wrong with the connection of each source and outlet, in words, by its name; empty: nothing."""
-        outlets = {name: publisher_trouble(one) for name, one in self._publishers.items()}
+        # a publisher of another package may say nothing
+        outlets = {name: str(getattr(publisher, "trouble", "")) for name, publisher in self._publishers.items()}
         return outlets | {name: outlets.get(name, "") or source.trouble for name, source in self.sources.items()}
 
     def _commit(self) -> None:

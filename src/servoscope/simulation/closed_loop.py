@@ -17,6 +17,7 @@ from servoscope.simulation.faults import FaultEvent, describe_plants, resolve_fa
 from servoscope.simulation.measurement import (
     NOISE_U_STD,
     NOISE_Y_STD,
+    FeedForward,
     Truth,
     check_reference,
     controller_constants,
@@ -41,7 +42,8 @@ def simulate(
 ) -> tuple[Recording, Truth]:
     """Simulate a loop with its plant, faults and noise.
 
-    The controller computes u(k) = k_p e(k) + k_i T sum e from e = r - y as measured, without anti-windup.
+    The controller computes u(k) = k_p e(k) + k_i T sum e + k_v (r(k) - r(k-1))/T from e = r - y as measured,
+    without anti-windup.
     Limits and the dead zone of the loop apply: inside the dead zone nothing passes, outside u acts as it
     is.
 
@@ -122,7 +124,7 @@ class LoopSimulation:
         discrete = [discretise(p.state_space(), loop.sample_rate, hold=loop.hold, delay=loop.delay) for p in plants]
         for each, what in zip(discrete, called, strict=True):
             check_stable(loop, each, what)
-        self._unlimited = loop.input_logged != "after_limiter"
+        self._unlimited, self._feed = loop.input_logged != "after_limiter", FeedForward(loop)
         self._kernel: Callable[..., object]
         if not loop.plant.linear:
             from servoscope.simulation.nonlinear_eha import nonlinear_run  # loads more than a linear loop needs
@@ -149,6 +151,8 @@ class LoopSimulation:
         """Return one at rest, whose constants are these."""
         other = copy.copy(self)
         other._state, other._past_input = np.zeros_like(self._state), np.zeros_like(self._past_input)
+        other._feed = copy.copy(self._feed)
+        other._feed.rewind()
         return other
 
     def run(
@@ -162,7 +166,7 @@ class LoopSimulation:
         noises = [nothing if noise is None else noise for noise in (n_u, n_y)]
         u, limited, y = np.empty((3, r.size))
         acting = np.concatenate([self._past_input, nothing])
-        self._kernel(which, r, *noises, self._state, u, limited, acting, y)
+        self._kernel(which, self._feed.run(r), *noises, self._state, u, limited, acting, y)
         past = self._past_input.size
         self._past_input = acting[r.size :]
         return (u if self._unlimited else limited), acting[past:], y

@@ -82,3 +82,38 @@ def controller_constants(loop: Loop) -> ControllerConstants:
     low, high = loop.input_limits or (-np.inf, np.inf)
     deadzone = loop.input_deadzone or (np.inf, -np.inf)
     return ControllerConstants(k_p, integral_gain, low, high, *deadzone, *split_delay(loop.delay, loop.sample_rate))
+
+
+class FeedForward:
+    """The reference under which a PI controller alone gives the u of a loop with feed-forward.
+
+    With r' = r + d the parts of r agree where ``(k_p + k_i T) d(k) = k_v (r(k) - r(k-1))/T - k_i T (d(k-1) + d(k-2) +
+    ...)``. The sum of the error never stops, so this holds at limits, too.
+    """
+
+    def __init__(self, loop: Loop) -> None:
+        k_p, integral_gain = controller_gains(loop)
+        assert loop.controller is not None
+        speed_gain, gain = loop.controller.k_v * loop.sample_rate, k_p + integral_gain
+        if integral_gain:
+            self.denominator = np.array([1.0, -k_p / gain, 0.0])
+            self.numerator = self.denominator + speed_gain / gain * np.array([1.0, -2.0, 1.0])
+        else:
+            self.denominator = np.array([1.0, 0.0])
+            self.numerator = self.denominator + speed_gain / gain * np.array([1.0, -1.0])
+        self.rewind()
+
+    def rewind(self) -> None:
+        """Forget all samples."""
+        self._state: FloatArray | None = None
+
+    def run(self, r: FloatArray) -> FloatArray:
+        """Return r' of the next samples, shape (N,); before the first of all, r was what it is there."""
+        from scipy.signal import lfilter, lfilter_zi
+
+        if np.array_equal(self.numerator, self.denominator):
+            return r
+        if self._state is None:
+            self._state = lfilter_zi(self.numerator, self.denominator) * (r[0] if r.size else 0.0)
+        ahead, self._state = lfilter(self.numerator, self.denominator, r, zi=self._state)
+        return np.asarray(ahead)

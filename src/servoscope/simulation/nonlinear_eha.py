@@ -18,6 +18,7 @@ from servoscope.simulation.faults import FaultEvent, PlantSchedule, describe_pla
 from servoscope.simulation.measurement import (
     NOISE_U_STD,
     NOISE_Y_STD,
+    FeedForward,
     Truth,
     check_reference,
     controller_constants,
@@ -166,12 +167,15 @@ def simulate_rig(
     limit = np.inf if rig.current_limit is None else rig.current_limit
     settings = settings._replace(low=max(settings.low, -limit), high=min(settings.high, limit))
     supply, leakage, friction, beta = parameters.values()
+    leakage = leakage + plant.K_c
     rows = np.column_stack([_flow_gain(plant, supply), 1.0 / supply, leakage, friction, 2.0 * beta / plant.V_o])
     physics, past = _rig_constants(plant, rig, loop, rows), settings.delay_samples + 2
     u, limited, y = np.empty((3, r.size))
     acting = np.zeros(past + r.size)
     state = np.zeros(HEADER_SIZE + 5)
-    measured, p_L, spool = run_rig(physics, settings, rows, r, n_u, n_y, state, u, limited, acting, y)
+    measured, p_L, spool = run_rig(
+        physics, settings, rows, FeedForward(loop).run(r), n_u, n_y, state, u, limited, acting, y
+    )
     acting = acting[past:]
     recording = make_recording(loop, r, limited if loop.input_logged == "after_limiter" else u, measured)
     ratios = {name: values[plan.plant_index] for name, values in plan.ratios.items()}
@@ -190,7 +194,7 @@ def nonlinear_run(loop: Loop, plants: Sequence[Plant], settings: ControllerConst
 
     _check_hold(loop)
     actuators = [plant for plant in plants if isinstance(plant, EHA)]
-    rows = np.array([[_flow_gain(p, p.p_s), 1.0 / p.p_s, p.C_ie, p.b_p, 1.0 / p.capacity] for p in actuators])
+    rows = np.array([[_flow_gain(p, p.p_s), 1.0 / p.p_s, p.C_ie + p.K_c, p.b_p, 1.0 / p.capacity] for p in actuators])
     first = actuators[0]
     rig = replace(
         Rig.ideal(), load_pressure_flow=first.load_pressure is not None, coulomb=first.coulomb, static=first.coulomb

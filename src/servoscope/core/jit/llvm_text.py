@@ -1,7 +1,7 @@
 """Traced arithmetic as LLVM's assembly: operations, memory, and the loops and branches around them.
 
 A function is written from front to back into one list of lines. A loop is a ``for`` statement over `LlvmPrinter.loop`,
-which runs its body once, a branch a ``with`` statement; numbers that change in them are `Cell`s.
+which runs its body once, a branch a ``with`` statement; numbers that change in them are `arrays.Variable`s.
 """
 
 from __future__ import annotations

@@ -10,21 +10,6 @@ from servoscope.core.jit.llvm_text import LlvmPrinter, TextLoop, vector
 from servoscope.core.jit.symbolic import Bool, Float, Int, SymbolRows
 
 
-class Cell:
-    """A whole number that changes."""
-
-    def __init__(self, printer: LlvmPrinter) -> None:
-        self._printer, self._place = printer, printer.stack("i64", 1)
-
-    def get(self) -> Int:
-        """Return it as it is now."""
-        return Int(self._printer, self._printer.load("i64", self._place))
-
-    def set(self, number: Int | int) -> None:
-        """Change it."""
-        self._printer.store("i64", str(number), self._place)
-
-
 @dataclass(frozen=True)
 class Memory:
     """Numbers in rows of some lanes; a `shared` memory has one lane for all, masks do not matter to a `scratch` one."""

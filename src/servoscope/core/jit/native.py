@@ -53,14 +53,15 @@ def object_folder() -> Path:
     return caches.expanduser() / "servoscope"
 
 
-def _machine() -> Any:
+def _machine(level: int = 2) -> Any:
+    """Return what makes machine code, at one of the `level`s of optimisation 0 to 3."""
     import llvmlite.binding as llvm
 
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     features = llvm.get_host_cpu_features().flatten()
     target = llvm.Target.from_default_triple()
-    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=features, opt=2, jit=True)
+    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=features, opt=level, jit=True)
 
 
 @functools.cache
@@ -110,24 +111,30 @@ def _entry(arguments: Sequence[tuple[str, str]], result: str, *, brief: bool) ->
     return "\n".join(["", *lines, *run, *widen, back, "  ret ptr %object", "}", ""])
 
 
-def _compile(text: str) -> bytes:
+def _compile(text: str, straight: bool = False) -> bytes:
     import llvmlite.binding as llvm
 
-    machine, module = _machine(), llvm.parse_assembly(text)
+    machine, module = _machine(1 if straight else 2), llvm.parse_assembly(text)
     module.triple, module.data_layout = machine.triple, str(machine.target_data)
     # Level 1 of 3: traced text has no calls and few loops, and what the others add made a log a third slower.
     builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(1))
-    builder.getModulePassManager().run(module, builder)
+    passes = builder.getModulePassManager()
+    if straight:  # the others found nothing, and took half of the time
+        passes = llvm.create_new_module_pass_manager()
+        passes.add_sroa_pass()
+        passes.add_instruction_combine_pass()
+        passes.add_simplify_cfg_pass()
+    passes.run(module, builder)
     return bytes(machine.emit_object(module))
 
 
-def object_code(name: str, text: str) -> bytes:
+def object_code(name: str, text: str, straight: bool = False) -> bytes:
     """Return the machine code of a module, from the cache if it is there under a name."""
     try:
         folder = object_folder()
     except RuntimeError:  # there is no home
         warn_of_missing_cache()
-        return _compile(text)
+        return _compile(text, straight)
     path = folder / f"{name}.o"
     try:
         kept = path.read_bytes()
@@ -135,7 +142,7 @@ def object_code(name: str, text: str) -> bytes:
             return kept[DIGEST_BYTES:]
     except OSError:
         pass  # not there yet, or not readable
-    code = _compile(text)
+    code = _compile(text, straight)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         part = folder / f"{name}.{os.getpid()}"
@@ -147,20 +154,26 @@ def object_code(name: str, text: str) -> bytes:
 
 
 def native_function(
-    text: str, arguments: Sequence[tuple[str, str]], result: str = "void", *, brief: bool = False
+    text: str,
+    arguments: Sequence[tuple[str, str]],
+    result: str = "void",
+    *,
+    brief: bool = False,
+    straight: bool = False,
 ) -> Callable[..., Any]:
     """Return the function `@run` of a module; a `brief` one keeps other threads waiting, which is faster.
 
-    Pointers are given as addresses (`address`).
+    Pointers are given as addresses (`address`). A `straight` one is mostly straight-line text, which needs little
+    optimisation.
     """
     import llvmlite.binding as llvm
 
     text += _entry(arguments, result, brief=brief)
-    name = hashlib.sha256((_toolchain() + text).encode()).hexdigest()[:32]
+    name = hashlib.sha256((_toolchain() + "straight" * straight + text).encode()).hexdigest()[:32]
     with LOCK:
         engine = _engine()
         if not engine.get_function_address(f"call_{name}"):
-            code = object_code(name, text.replace("@call(", f"@call_{name}("))
+            code = object_code(name, text.replace("@call(", f"@call_{name}("), straight)
             engine.add_object_file(llvm.ObjectFileRef.from_data(code))
             engine.finalize_object()
         place = engine.get_function_address(f"call_{name}")

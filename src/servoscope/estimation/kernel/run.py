@@ -12,8 +12,9 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from servoscope.core.jit import where
+from servoscope.core.jit.arrays import Variable
 from servoscope.core.jit.llvm_text import LlvmPrinter, vector
-from servoscope.core.jit.memory import Cell, Memory, apply, repeat
+from servoscope.core.jit.memory import Memory, apply, repeat
 from servoscope.core.jit.native import native_function
 from servoscope.core.jit.symbolic import Bool, Float, Int, maximum, minimum
 from servoscope.estimation import estimators
@@ -61,7 +62,7 @@ class LaneBlock:
         self.cusum_lanes = CUSUM_BATCH if lanes == 1 else lanes
         self.top = Memory(printer, printer.stack(element, TILE * self.cusum_lanes), element, self.cusum_lanes)
         self.level = memory(TILE) if lanes == 1 else self.top
-        self.phase = Cell(printer)
+        self.phase = Variable(printer, 0)
 
     def process(self, c: Memory, begin: Any, end: Any, stride: Int, first: Bool, last: Bool, extra: Memory) -> None:
         """Write how samples of the tile are processed; `first` and `last` begin and end an evaluation."""
@@ -102,9 +103,9 @@ class LaneBlock:
         """Write how samples are processed one by one, whatever their status."""
         p, steps = self.p, self.steps
         for i in p.loop(begin, end):
-            phase = self.phase.get() + 1
+            phase = self.phase.value + 1
             due = phase.is_equal(stride)
-            self.phase.set(where(due, 0, phase))
+            self.phase.value = where(due, 0, phase)
             self.filter_sample(c, i, due)
             used, rests = apply(steps.classify_update, self.status)
             with p.when(p.holds("or", used)):
@@ -264,7 +265,7 @@ def run_blocks(p: LlvmPrinter, spec: KernelSpec, lanes: int, element: str, own: 
     samples, every, stride, assets = (whole[name] for name in ("samples", "every", "stride", "assets"))
     floats, private = HEADER_SIZE + size.floats + size.watched, size.extra
     q = Memory(p, p.stack(element, size.row * lanes), element, lanes)
-    k, since, window, column = (Cell(p) for _ in range(4))
+    k, since, window, column = (Variable(p, 0) for _ in range(4))
     for b in p.loop(whole["begin"], whole["end"]):
         place = p.place(element, "%constants", b * whole["constant_step"])
         c = Memory(p, place, element, lanes, shared=lanes > 1 and not own)
@@ -277,28 +278,28 @@ def run_blocks(p: LlvmPrinter, spec: KernelSpec, lanes: int, element: str, own: 
             p.store("double", p.load("double", p.place("double", "%state", at)), p.place("double", "%new", at))
         extra = Memory(p, p.place("double", "%new", states[0] + floats), "double")
         number = p.truncate(Float(p, p.load("double", p.place("double", "%state", SAMPLE)), "double"))
-        since.set(number % every)
-        block.phase.set(number % stride)
-        k.set(0)
-        column.set(0)
-        window.set(-TILE)
-        for _ in p.loop_while(lambda: k.get() < samples):
-            count = minimum(minimum(samples - k.get(), every - since.get()), TILE)
-            with p.when(k.get() + count > window.get() + TILE):
-                window.set(maximum(minimum(k.get(), samples - TILE), 0))
-                places = [asset * samples + window.get() for asset in row]
+        since.value = number % every
+        block.phase.value = number % stride
+        k.value = 0
+        column.value = 0
+        window.value = -TILE
+        for _ in p.loop_while(lambda: k.value < samples):
+            count = minimum(minimum(samples - k.value, every - since.value), TILE)
+            with p.when(k.value + count > window.value + TILE):
+                window.value = maximum(minimum(k.value, samples - TILE), 0)
+                places = [asset * samples + window.value for asset in row]
                 block.fetch(("%r", "%u", "%y"), places, samples)
                 with p.when(whole["restarts"] > 0):
                     block.fetch_restarts("%restart", places, samples)
-            begin, ends = k.get() - window.get(), since.get() + count
+            begin, ends = k.value - window.value, since.value + count
             last = ends.is_equal(every)
-            block.process(c, begin, begin + count, stride, since.get().is_equal(0), last, extra)
-            k.set(k.get() + count)
-            since.set(where(last, 0, ends))
+            block.process(c, begin, begin + count, stride, since.value.is_equal(0), last, extra)
+            k.value = k.value + count
+            since.value = where(last, 0, ends)
             with p.when(last):
                 block.evaluate(c, q)
-                block.write_out(q, "%out", [asset * whole["out_step"] + column.get() for asset in row])
-                column.set(column.get() + size.row)
+                block.write_out(q, "%out", [asset * whole["out_step"] + column.value for asset in row])
+                column.value = column.value + size.row
         block.pack("%new", states)
 
 
@@ -314,7 +315,7 @@ def run_sample(p: LlvmPrinter, spec: KernelSpec, lanes: int, element: str, own: 
     block.unpack("%state", [zero])
     for k, name in enumerate(("%r", "%u", "%y", p.constant(0.0, "double"))):
         block.tile.store(k * TILE, name)
-    block.phase.set(number % stride)
+    block.phase.value = number % stride
     last = ((number + 1) % every).is_equal(0)
     extra = state.behind(HEADER_SIZE + size.floats + size.watched)
     block.process(c, 0, 1, stride, (number % every).is_equal(0), last, extra)
@@ -374,4 +375,5 @@ def compile_function(name: str, spec: KernelSpec, lanes: int = 1, single: bool =
     write(printer, spec, lanes, "float" if single else "double", own)
     if result == "void":
         printer.write("ret void")
-    return native_function(printer.text(), arguments, result, brief=name == "run_sample")
+    is_step = name == "run_sample"  # one sample at a time, for which all optimisation pays
+    return native_function(printer.text(), arguments, result, brief=is_step, straight=not is_step)

@@ -7,7 +7,8 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from servoscope.models.plants.base import SIGN_CUTOFF, Fault, read_translations
+from servoscope.core.errors import LoopError
+from servoscope.models.plants.base import SIGN_CUTOFF, Fault, StateSpace, read_translations
 from servoscope.models.plants.columns import Column
 from servoscope.models.plants.terms import TermColumn, TermPlant
 
@@ -187,3 +188,7 @@ class CylinderPlant(TermPlant):
             for parameter, (name, range_, words, checks) in FAULTS.items()
             if parameter in EXPONENTS or parameter in self.names
         )
+
+    def state_spaces(self, factors: Mapping[str, Any], count: int) -> StateSpace:
+        """Raise LoopError: see `has_physics`."""
+        raise LoopError('[plant] kind = "cylinder": cannot be simulated from its coefficients; simulate_cylinder can')

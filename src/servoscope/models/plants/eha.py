@@ -52,8 +52,8 @@ class EHA(Plant):
     ::
 
         m_p y'' = A_p p_L - b_p y' - k_p y
-        V_o/(2 beta) p_L' = K_q u - C_ie p_L - A_p y',   K_q = K_m C_d W sqrt(p_s/rho)
-        1/G(s) = ((V_o/(2 beta) s + C_ie)(m_p s^2 + b_p s + k_p) + A_p^2 s)/(A_p K_q)      (1), (2)
+        V_o/(2 beta) p_L' = K_q u - (C_ie + K_c) p_L - A_p y',   K_q = K_m C_d W sqrt(p_s/rho)
+        1/G(s) = ((V_o/(2 beta) s + C_ie + K_c)(m_p s^2 + b_p s + k_p) + A_p^2 s)/(A_p K_q)      (1), (2)
     """
 
     names: ClassVar[tuple[str, ...]] = ("theta_0", "theta_1", "theta_2", "theta_3")
@@ -77,6 +77,8 @@ class EHA(Plant):
     C_d: PlausiblePositive  # discharge coefficient of the valve [1]
     W: PlausiblePositive  # area gradient of the valve [m]
     K_m: PlausiblePositive  # spool displacement per current [m/A]
+    # flow-pressure coefficient of the valve [m^3/(s Pa)], by which its flow falls with the load (Merritt, 1967)
+    K_c: Annotated[NonNegative, Field(exclude_if=lambda value: value == 0.0)] = 0.0
     # ``square-root``: the flow is K_q u sqrt(1 - sign(u) p_L/p_s), with the coefficients as they are; ``linear``: it is
     # K_q u
     valve_law: Literal["linear", "square-root"] = "linear"
@@ -115,11 +117,11 @@ class EHA(Plant):
 
     def theta(self) -> FloatArray:
         """Coefficients of 1/G, shape (4,) [A/m, A s/m, A s^2/m, A s^3/m], eq. (2)."""
-        capacity = self.capacity
+        capacity, leakage = self.capacity, self.C_ie + self.K_c
         coefficients = [
-            self.C_ie * self.k_p,
-            capacity * self.k_p + self.C_ie * self.b_p + self.A_p**2,
-            capacity * self.b_p + self.C_ie * self.m_p,
+            leakage * self.k_p,
+            capacity * self.k_p + leakage * self.b_p + self.A_p**2,
+            capacity * self.b_p + leakage * self.m_p,
             capacity * self.m_p,
         ]
         return np.array(coefficients) / (self.A_p * self.flow_gain)
@@ -143,7 +145,7 @@ class EHA(Plant):
         A = [
             [0.0, 1.0, 0.0],
             [-one.k_p / m_p, -one.b_p / m_p, one.A_p / m_p],
-            [0.0, -one.A_p / capacity, -one.C_ie / capacity],
+            [0.0, -one.A_p / capacity, -(one.C_ie + one.K_c) / capacity],
         ]
         B = [[0.0], [0.0], [one.input_gain * one.flow_gain / capacity]]
         return matrices(A, count), matrices(B, count), matrices([[1.0, 0.0, 0.0]], count)

@@ -14,12 +14,12 @@ import numpy as np
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import StateError
 from servoscope.core.messages import message, render
-from servoscope.diagnosis.follower import DiagnosisSchedule
 from servoscope.diagnosis.monitor import Monitor
+from servoscope.diagnosis.schedule import DiagnosisSchedule
 from servoscope.prognosis.forecast import Prognosis
 from servoscope.service.alarms import AlarmSettings, AlarmTransition, OperatorCommand
 from servoscope.service.assets.alarms import AssetAlarms
-from servoscope.service.assets.block_lanes import BlockLanes, LaneOutput
+from servoscope.service.assets.block_lanes import BlockLanes, Followed
 from servoscope.service.assets.checkpoint import AssetState, StreamPosition, evolve
 from servoscope.service.assets.examination import StoredDiagnosis, carry_covariates, examine_blocks
 from servoscope.service.assets.examination_schedule import (
@@ -195,12 +195,12 @@ class Asset(StateHolder):
             return self._leave_out(block, "late", behind_s=position.t - start)
         return NextBlock(block, continuity)
 
-    def follow(self, accepted: NextBlock) -> LaneOutput:
+    def follow(self, accepted: NextBlock) -> Followed:
         """Follow an accepted block alone."""
         block, restart = accepted.block, accepted.continuity.is_broken
         return self.lanes.follow(self.monitor, self._current, block.signals, restart=restart)
 
-    def conclude(self, accepted: NextBlock, followed: LaneOutput) -> StepResult:
+    def conclude(self, accepted: NextBlock, followed: Followed) -> StepResult:
         """Take what an accepted block has led to."""
         before = self.take_state()
         self._count(accepted, followed)
@@ -323,9 +323,9 @@ class Asset(StateHolder):
     def _add_sizes(self, rows: Iterable[dict[str, Any]]) -> None:
         self._result.rows.extend(TableRow("sizes", row) for row in rows)
 
-    def _count(self, accepted: NextBlock, followed: LaneOutput) -> None:
+    def _count(self, accepted: NextBlock, followed: Followed) -> None:
         """Keep a block and the state after it."""
-        (block, continuity, packed), state = accepted, self._current
+        (block, continuity, packed), state, (after, history) = accepted, self._current, followed
         position, (samples, regular) = state.position, packed or pack_samples(block.signals[None])[0]
         # stored under a number of our own, because the sender's may begin anew
         self._window.append((position.blocks, block.t.item(0), block.t.item(-1), block.t.size, samples, regular))
@@ -334,16 +334,10 @@ class Asset(StateHolder):
         if continuity.is_broken:
             self._result.rows.append(continuity.audit_row(position, block))
         self.state = evolve(
-            state,
-            monitor=followed.monitor,
-            samples=followed.samples,
-            quality=followed.quality,
-            history=followed.history,
-            evaluation=followed.evaluation or state.evaluation,
-            last_t=followed.last_t,
+            after,
             position=evolve(
                 position,
-                t=position.t if followed.last_t is None else followed.last_t,
+                t=position.t if after.last_t is None else after.last_t,
                 sequence=block.sequence,
                 stream=block.stream,
                 blocks=position.blocks + 1,
@@ -352,7 +346,7 @@ class Asset(StateHolder):
                 digest=zlib.crc32(block.pack(), position.digest),
             ),
         )
-        for row in followed.rows:
+        for row in history:
             self._add_row("residuals", **row)
         evaluation = self._current.evaluation
         if evaluation.t is not None and period_number(evaluation.t) != period_number(state.evaluation.t):

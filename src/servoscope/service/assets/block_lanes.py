@@ -14,32 +14,19 @@ import numpy.typing as npt
 from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.monitor import Monitor
-from servoscope.service.assets.checkpoint import AssetState
+from servoscope.service.assets.checkpoint import AssetState, evolve
 from servoscope.service.assets.residual_history import (
     HistoryState,
     LastEvaluations,
     LatestEvaluation,
-    history_row,
-    ifrf_residual,
     known_excess,
-    residual_rows,
     update_history,
 )
 from servoscope.service.layer_times import LayerTimes
 from servoscope.signals import quality
 from servoscope.signals.timebase import MAX_TIME_S, Timebase
 
-
-class LaneOutput(NamedTuple):
-    """What a block has led to."""
-
-    monitor: FloatArray
-    quality: FloatArray
-    samples: int  # that the monitor has processed so far
-    last_t: float | None  # time of the last one [UTC s]
-    history: HistoryState
-    rows: list[dict[str, Any]]  # of the history that are complete
-    evaluation: LatestEvaluation | None  # None: the block has none
+Followed = tuple[AssetState, list[dict[str, Any]]]  # the state after a block but for its position; rows of the history
 
 
 class LaneEvaluations:
@@ -67,30 +54,22 @@ class LaneEvaluations:
         """Add those of an asset to its history, as `residual_history.update_history` does."""
         return update_history(state, self._trace.lane(lane), self._times[lane], self._every_s)
 
-    def count_periods(self, before: FloatArray) -> IndexArray:
-        """Return how many periods of the history begin with them; `before`: those under way, shape (assets,)."""
-        return np.asarray(np.count_nonzero(np.diff(self.periods, prepend=before[:, None]), axis=1))
-
     def update_histories(
         self, lanes: IndexArray, period: FloatArray, peaks: FloatArray
-    ) -> tuple[FloatArray, IndexArray, list[dict[str, Any]]]:
-        """Add those of some assets to their histories, as `update_history` does, where no more than one row is due.
+    ) -> tuple[FloatArray, list[tuple[int, dict[str, Any]]]]:
+        """Add those of some assets to their histories.
 
         `period`: under way, shape (lanes,); `peaks`: its largest statistics, shape (2, lanes). Returns the peaks of the
-        period that is under way then, in which of the lanes a row is due, and these rows.
+        period that is under way then, and the rows that are complete, each with the place of its lane.
         """
-        begins, largest = np.diff(self.periods[lanes], prepend=period[:, None]) != 0.0, self.peaks[[2, 1]][:, lanes]
-        due, after = np.flatnonzero(begins.any(axis=1)), np.where(largest > peaks, largest, peaks)
-        if not due.size:
-            return after, due, []
-        own, place = lanes[due], begins[due].argmax(axis=1)
-        found = np.stack([known_excess(self._trace)[own], self._trace.level[own]])
-        is_before = np.arange(found.shape[-1]) <= place[:, None]
-        until, since = (np.where(side, found, 0.0).max(axis=-1) for side in (is_before, ~is_before))
-        until, after[:, due] = np.where(until > peaks[:, due], until, peaks[:, due]), np.where(since > 0.0, since, 0.0)
-        residuals = map(residual_rows, ifrf_residual(self._trace, (own, place)))
-        rows = zip(self._times[own, place].tolist(), *until.tolist(), residuals, strict=True)
-        return after, due, [history_row(*row) for row in rows]
+        largest, rows = self.peaks[[2, 1]][:, lanes], list[tuple[int, dict[str, Any]]]()
+        after = np.where(largest > peaks, largest, peaks)
+        for k in np.flatnonzero(self.periods[lanes, -1] != period).tolist():  # few at a time
+            before = HistoryState(int(period[k]), *peaks[:, k].tolist())
+            state, complete = self.update_history(int(lanes[k]), before)
+            after[:, k] = state.excess, state.level
+            rows += [(k, row) for row in complete]
+        return after, rows
 
 
 class LanesOutput(NamedTuple):
@@ -102,15 +81,22 @@ class LanesOutput(NamedTuple):
     size: int  # samples of each block
     evaluations: LaneEvaluations | None  # None: the blocks have none
 
-    def lane(self, lane: int, state: AssetState) -> LaneOutput:
+    def lane(self, lane: int, state: AssetState) -> Followed:
         """Return that of one asset, with the state before it."""
-        history, rows, latest = state.history, list[dict[str, Any]](), None
+        history, rows, latest = state.history, list[dict[str, Any]](), state.evaluation
         if self.evaluations is not None:
             history, rows = self.evaluations.update_history(lane, history)
             latest = self.evaluations.latest(lane)
-        # copies: an asset that falls silent must not hold the arrays of all others
-        new, seen = self.monitor[lane].copy(), self.quality[lane].copy()
-        return LaneOutput(new, seen, state.samples + self.size, float(self.t[lane]), history, rows, latest)
+        after = evolve(
+            state,
+            monitor=self.monitor[lane].copy(),  # an asset that falls silent must not hold the arrays of all others
+            quality=self.quality[lane].copy(),
+            samples=state.samples + self.size,
+            last_t=float(self.t[lane]),
+            history=history,
+            evaluation=latest,
+        )
+        return after, rows
 
 
 class BlockLanes:
@@ -120,7 +106,7 @@ class BlockLanes:
         self._rate, self._limits, self._residual_every_s = rate, limits, residual_every_s
         self._timebase = Timebase(1.0 / rate)
 
-    def follow(self, monitor: Monitor, state: AssetState, block: FloatArray, *, restart: bool) -> LaneOutput:
+    def follow(self, monitor: Monitor, state: AssetState, block: FloatArray, *, restart: bool) -> Followed:
         """Follow a block of one asset, in whatever order its samples are.
 
         `block`: t, r, u, y and covariates, shape (4 + k, N); `restart`: whether samples before it are missing.
@@ -137,11 +123,20 @@ class BlockLanes:
         checked, _ = quality.tick(self._limits, checked, state.position.t if last_t is None else last_t)
         times = t[self._evaluated_samples(trace, state.samples)]
         history, rows = update_history(state.history, trace, times, self._residual_every_s)
-        evaluation = None
+        evaluation = state.evaluation
         if times.size:
             excess, level, _ = _peaks(trace).tolist()
             evaluation = LatestEvaluation.from_trace(trace, float(times[-1]), (excess, level))
-        return LaneOutput(new, checked, state.samples + len(t), last_t, history, rows, evaluation)
+        after = evolve(
+            state,
+            monitor=new,
+            quality=checked,
+            samples=state.samples + len(t),
+            last_t=last_t,
+            history=history,
+            evaluation=evaluation,
+        )
+        return after, rows
 
     def are_regular(self, t: FloatArray, last: FloatArray) -> BoolArray:
         """Tell which of some blocks, with times `t` (blocks, N), need no sorting, nor a second look at what was `last`.
@@ -160,23 +155,23 @@ class BlockLanes:
         before: tuple[FloatArray, FloatArray],
         samples: int,
         signals: FloatArray,
+        begins: BoolArray,
         layers: LayerTimes,
-        *,
-        begins: bool = False,
     ) -> LanesOutput:
         """Follow regular blocks of the assets of a fleet, of one length and one phase, side by side.
 
         `before`: states of monitor and data quality, shape (blocks, ...) each; `samples`: that the monitor of the first
-        asset has processed; `signals`: of the blocks, shape (blocks, 4 + k, N); `begins`: whether nothing came before.
+        asset has processed; `signals`: of the blocks, shape (blocks, 4 + k, N); `begins`: before which of
+        them nothing came.
         """
         t, given = signals[:, 0], signals[:, 1:4]
         known = np.isfinite(given)
         used = given if known.all() else np.where(known, given, np.nan)
         layers.enter("kernel")
         restart = None
-        if begins:
+        if begins.any():
             restart = np.zeros(t.shape, dtype=np.bool_)
-            restart[:, 0] = True
+            restart[:, 0] = begins
         monitors, trace = fleet.run(before[0], used[:, 0], used[:, 1], used[:, 2], restart)
         layers.enter("quality")
         checked = quality.check_lanes(self._limits, before[1], t, given)

@@ -16,8 +16,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from servoscope.core.messages import message, render
-from servoscope.diagnosis.follower import DiagnosisSchedule
 from servoscope.diagnosis.result import Verdict
+from servoscope.diagnosis.schedule import DiagnosisSchedule
 from servoscope.service.assets.examination import StoredDiagnosis
 from servoscope.service.config import DiagnosisSettings
 

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from servoscope.core.arrays import FloatArray, IndexArray
+from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.core.errors import ServoscopeError
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.service.assets.asset import Asset
@@ -75,7 +75,7 @@ class AssetGroups:
         for key, own in monitors.items():
             if len(names := members[key]) > 1:
                 size = len(assets[names[0]].monitor.init())
-                baselines = {each: i for i, each in enumerate(own)}
+                baselines = {monitor: i for i, monitor in enumerate(own)}
                 for row, name in enumerate(names):
                     asset = assets[name]
                     self._places[name] = _Place(asset, len(self._fleets), baselines[id(asset.monitor)], row)
@@ -90,11 +90,11 @@ class AssetGroups:
         while waiting:
             self.layers.enter("assemble")
             turn, later = dict[str, Block](), list[Block]()  # a round has at most one block of each asset
-            for one in waiting:
-                if one.asset in turn:
-                    later.append(one)
+            for block in waiting:
+                if block.asset in turn:
+                    later.append(block)
                 else:
-                    turn[one.asset] = one
+                    turn[block.asset] = block
             waiting = later
             yield from self._process_round(turn.values(), latest)
 
@@ -134,34 +134,6 @@ class AssetGroups:
         self.layers.enter("judge")
         return asset.conclude(accepted, followed)
 
-    def _process_first(
-        self, fleet: _Fleet, placed: Sequence[_PlacedBlock], signals: FloatArray, latest: float, alone: list[Block]
-    ) -> Iterator[BlockResult]:
-        """Process the first blocks of assets, of one shape; those that must go `alone` are added there.
-
-        One by one they take twice as long, and all assets of a plant may begin at once.
-        """
-        self.layers.enter("assemble")
-        lanes, t = placed[0][0].asset.lanes, signals[:, 0]
-        begins = lanes.begin_regularly(t) & ~(t[:, -1] > latest)
-        begins &= np.array([not block.stream or not block.sequence for _, block in placed])
-        chosen = np.flatnonzero(begins)
-        own = [placed[i] for i in chosen.tolist()]
-        alone += [placed[i][1] for i in np.flatnonzero(~begins).tolist()]
-        if not own:
-            return
-        self.layers.enter("judge")
-        accepted = [place.asset.accept(block, latest) for place, block in own]
-        states = [place.asset.take_state() for place, _ in own]
-        before = np.stack([one.monitor for one in states]), np.stack([one.quality for one in states])
-        part = fleet.monitor.select(np.array([place.baseline for place, _ in own]))
-        found = lanes.follow_lanes(part, before, 0, signals[chosen], self.layers, begins=True)
-        packed = pack_samples(signals[chosen])
-        for i, ((place, block), one) in enumerate(zip(own, accepted, strict=True)):
-            assert isinstance(one, NextBlock), "nothing came before it, and it is not of the future"
-            result = place.asset.conclude(one._replace(packed=packed[i]), found.lane(i, states[i]))
-            yield BlockResult(block, result)
-
     def _process_together(
         self, fleet: _Fleet, placed: Sequence[_PlacedBlock], signals: FloatArray, latest: float, alone: list[Block]
     ) -> Iterator[BlockResult | QuietBlocks]:
@@ -169,30 +141,32 @@ class AssetGroups:
         self.layers.enter("assemble")
         states, t = fleet.states, signals[:, 0]
         rows = np.array([place.row for place, _ in placed])
-        is_begun = np.ones(len(rows), dtype=np.bool_)
+        lanes, is_new = placed[0][0].asset.lanes, np.zeros(len(rows), dtype=np.bool_)
+        # first blocks as well: one by one they take twice as long, and all assets of a plant may begin at once
+        can_begin = lanes.begin_regularly(t) & ~(t[:, -1] > latest)
         for i in np.flatnonzero(~states.columns["is_here"][rows]).tolist():
-            place, _ = placed[i]
-            if place.asset.heard:
-                place.asset.move_state(states, place.row)
-            else:
-                is_begun[i] = False
-        if not is_begun.all():
-            first = np.flatnonzero(~is_begun)
-            yield from self._process_first(fleet, [placed[i] for i in first.tolist()], signals[first], latest, alone)
-            self.layers.enter("assemble")
-        monitors, lanes = states.monitor[rows], placed[0][0].asset.lanes
+            place, block = placed[i]
+            if not place.asset.heard:
+                if not can_begin[i] or (block.stream and block.sequence):
+                    continue
+                place.asset.accept(block, latest)
+                is_new[i] = True
+            place.asset.move_state(states, place.row)
         follows = states.are_next(rows, [block.sequence for _, block in placed], [block.stream for _, block in placed])
-        follows &= is_begun & lanes.are_regular(t, states.columns["last_t"][rows]) & ~(t[:, -1] > latest)
+        follows &= lanes.are_regular(t, states.columns["last_t"][rows]) & ~(t[:, -1] > latest)
+        follows = (follows & states.columns["is_here"][rows]) | is_new
+        monitors = states.monitor[rows]
         phases = fleet.monitor.phase(monitors)
         for phase in [-1, *np.unique(phases[follows]).tolist()]:
-            chosen = np.flatnonzero(follows & (phases == phase) if phase >= 0 else is_begun & ~follows)
-            group = placed if chosen.size == len(placed) else [placed[i] for i in chosen.tolist()]
+            chosen = np.flatnonzero(follows & (phases == phase) if phase >= 0 else ~follows)
+            group = [placed[i] for i in chosen.tolist()]
             if phase < 0 or len(group) == 1:
                 alone += [block for _, block in group]
-            elif group is placed:
-                yield from self._process_lanes(fleet, group, rows, monitors, signals)
+            elif len(group) == len(placed):
+                yield from self._process_lanes(fleet, group, rows, monitors, signals, is_new)
             else:
-                yield from self._process_lanes(fleet, group, rows[chosen], monitors[chosen], signals[chosen])
+                some = rows[chosen], monitors[chosen], signals[chosen], is_new[chosen]
+                yield from self._process_lanes(fleet, group, *some)
 
     def _process_lanes(
         self,
@@ -201,25 +175,29 @@ class AssetGroups:
         rows: IndexArray,
         monitors: FloatArray,
         signals: FloatArray,
+        is_new: BoolArray,
     ) -> Iterator[BlockResult | QuietBlocks]:
-        """Process regular blocks, whose assets are of one phase; their states are in these rows."""
+        """Process regular blocks, whose assets are of one phase; their states are in these rows.
+
+        `is_new`: which of the assets begin with them.
+        """
         self.layers.enter("assemble")
         assets, blocks, states = [place.asset for place, _ in placed], [block for _, block in placed], fleet.states
         part = fleet.monitor.select(np.array([place.baseline for place, _ in placed]))
         before, samples = (monitors, states.quality[rows]), int(states.columns["samples"][rows[0]])
-        found = assets[0].lanes.follow_lanes(part, before, samples, signals, self.layers)
-        are_quiet, packed = states.are_quiet(rows, found), pack_samples(signals)
+        output = assets[0].lanes.follow_lanes(part, before, samples, signals, is_new, self.layers)
+        are_quiet, packed = states.are_quiet(rows, output) & ~is_new, pack_samples(signals)
         for i in np.flatnonzero(~are_quiet).tolist():
             accepted = NextBlock(blocks[i], packed=packed[i])
-            followed = found.lane(i, assets[i].take_state())
+            followed = output.lane(i, assets[i].take_state())
             yield BlockResult(blocks[i], assets[i].conclude(accepted, followed))
         quiet = np.flatnonzero(are_quiet)
         if quiet.size:
             chosen = quiet.tolist()
             own, theirs = [packed[i] for i in chosen], [assets[i] for i in chosen]
-            numbers, history = states.advance(rows[quiet], found, quiet, signals)
+            numbers, history = states.advance(rows[quiet], output, quiet, signals)
             times = signals[quiet, 0][:, [0, -1]].T.tolist()
-            kept = list(zip(numbers, *times, repeat(found.size, quiet.size), *zip(*own, strict=True), strict=True))
+            kept = list(zip(numbers, *times, repeat(output.size, quiet.size), *zip(*own, strict=True), strict=True))
             for asset, block in zip(theirs, kept, strict=True):
                 asset.keep(block)
             yield QuietBlocks(theirs, [blocks[i] for i in chosen], kept, history)

@@ -144,54 +144,55 @@ class AssetStates:
 
     def are_next(self, rows: IndexArray, sequences: Sequence[int], streams: Sequence[int]) -> BoolArray:
         """Tell which of some blocks follow what was counted."""
-        one = self.columns[rows]
-        return np.asarray((one["sequence"] + 1 == sequences) & (one["stream"] == streams))
+        columns = self.columns[rows]
+        return np.asarray((columns["sequence"] + 1 == sequences) & (columns["stream"] == streams))
 
-    def are_quiet(self, rows: IndexArray, found: LanesOutput) -> BoolArray:
-        """Tell which blocks lead to nothing but the state after them; `found`: what they have led to so far."""
-        one, active = self.columns[rows], quality.ACTIVE
-        quiet = (one["since"] <= found.t) & (found.t < one["until"])
-        quiet &= (found.quality[:, active] == self.quality[rows, active]).all(axis=1)
-        exceeded, new = one["exceeded"], found.evaluations
+    def are_quiet(self, rows: IndexArray, output: LanesOutput) -> BoolArray:
+        """Tell which blocks lead to nothing but the state after them; `output`: what they have led to so far."""
+        columns, active = self.columns[rows], quality.ACTIVE
+        quiet = (columns["since"] <= output.t) & (output.t < columns["until"])
+        quiet &= (output.quality[:, active] == self.quality[rows, active]).all(axis=1)
+        exceeded, new = columns["exceeded"], output.evaluations
         if new is not None:
             exceeded = new.exceeded
-            quiet &= np.isfinite(one["period"]) & (new.count_periods(one["period"]) <= 1)
-        return np.asarray(quiet & (exceeded == one["is_fault"]))
+            quiet &= np.isfinite(columns["period"])
+        return np.asarray(quiet & (exceeded == columns["is_fault"]))
 
     def advance(
-        self, rows: IndexArray, found: LanesOutput, lanes: IndexArray, signals: FloatArray
+        self, rows: IndexArray, output: LanesOutput, lanes: IndexArray, signals: FloatArray
     ) -> tuple[list[int], list[tuple[int, TableRow]]]:
         """Take what some `lanes` of quiet blocks have led to.
 
         `signals`: of all lanes, shape (blocks, 4 + k, N); the digest goes on as by what `Block.pack` returns. Returns
         the numbers of the blocks, and rows of the history and of the coefficients, each with the place of its lane.
         """
-        one, new = self.columns[rows], found.evaluations
+        columns, new = self.columns[rows], output.evaluations
         tail, numbers_of = covariate_tail(signals.shape[1] - 4), signals.astype("<f8", copy=False)
-        digests = zip(lanes.tolist(), one["digest"].tolist(), strict=True)
-        numbers, history = one["blocks"].tolist(), list[tuple[int, TableRow]]()
-        one["t"] = one["last_t"] = one["alarms_at"] = found.t[lanes]
-        one["digest"] = [zlib.crc32(tail, zlib.crc32(numbers_of[lane], before)) for lane, before in digests]
-        for name, more in (("sequence", 1), ("blocks", 1), ("counted", found.size), ("samples", found.size)):
-            one[name] += more
+        digests = zip(lanes.tolist(), columns["digest"].tolist(), strict=True)
+        numbers, history = columns["blocks"].tolist(), list[tuple[int, TableRow]]()
+        columns["t"] = columns["last_t"] = columns["alarms_at"] = output.t[lanes]
+        columns["digest"] = [zlib.crc32(tail, zlib.crc32(numbers_of[lane], before)) for lane, before in digests]
+        for name, more in (("sequence", 1), ("blocks", 1), ("counted", output.size), ("samples", output.size)):
+            columns[name] += more
         if new is not None:
-            before = np.stack([one["excess"], one["level"]])
-            (one["excess"], one["level"]), due, values = new.update_histories(lanes, one["period"], before)
-            one["period"] = new.periods[lanes, -1]
-            one["rows"][due] += 1
-            counts = one["rows"][due].tolist()
-            history = [
-                (lane, TableRow("residuals", {"number": number, **row}))
-                for lane, number, row in zip(due.tolist(), counts, values, strict=True)
-            ]
-            sized = new.t[lanes] // SIZE_EVERY_S != one["evaluated"] // SIZE_EVERY_S  # as `period_number` says
+            before = np.stack([columns["excess"], columns["level"]])
+            (columns["excess"], columns["level"]), complete = new.update_histories(lanes, columns["period"], before)
+            columns["period"] = new.periods[lanes, -1]
+            for lane, row in complete:
+                columns["rows"][lane] += 1
+                history.append((lane, TableRow("residuals", {"number": columns["rows"][lane].item(), **row})))
+            sized = new.t[lanes] // SIZE_EVERY_S != columns["evaluated"] // SIZE_EVERY_S  # as `period_number` says
             for lane in np.flatnonzero(sized).tolist():
                 latest = new.latest(int(lanes[lane]))
                 sizes = coefficient_rows(float(new.t[lanes[lane]]), latest.status.parameters)
                 history += [(lane, TableRow("sizes", row)) for row in sizes]
-            one["exceeded"], one["evaluated"], one["lane"] = new.exceeded[lanes], new.t[lanes], lanes
+            columns["exceeded"], columns["evaluated"], columns["lane"] = new.exceeded[lanes], new.t[lanes], lanes
             self._evaluations[rows] = new
-        self.columns[rows], self.monitor[rows], self.quality[rows] = one, found.monitor[lanes], found.quality[lanes]
+        self.columns[rows], self.monitor[rows], self.quality[rows] = (
+            columns,
+            output.monitor[lanes],
+            output.quality[lanes],
+        )
         return numbers, history
 
 

@@ -24,11 +24,6 @@ class StatusPublisher(Protocol):
         """Stop; it may be called twice."""
 
 
-def publisher_trouble(publisher: StatusPublisher) -> str:
-    """Return why nobody can be shown anything, in words; empty: nothing is wrong, or it is none that tells."""
-    return str(getattr(publisher, "trouble", ""))
-
-
 class PublisherSettings(Settings):
     """A table ``[outlets.NAME]``; a subclass adds the keys of its kind and says which publisher it creates."""
 
