@@ -46,7 +46,7 @@ figures: $(STAMP)  ## run the programs behind the figures of the documents, and 
 	$(BIN)/python scripts/figures.py --run
 
 pictures: $(STAMP)  ## the pictures of the pages in docs/images/pages, from the browser's tests
-	SCREENSHOTS=docs/images/pages $(BIN)/python -m pytest -n 0 tests/web/test_web_pages.py tests/web/test_web_files.py
+	SCREENSHOTS=docs/images/pages $(BIN)/python -m pytest -n 0 tests/web/test_web_pages.py tests/web/test_web_action.py tests/web/test_web_files.py
 
 docs: $(STAMP)     ## the site of docs/, as wheels have it: servoscope docs opens it
 	$(BIN)/python -m sphinx -q -W -E -d build/docs docs src/servoscope/site

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 __all__ = [
+    "Assessment",
     "Baseline",
     "Columns",
     "Diagnosis",
@@ -25,6 +26,7 @@ __all__ = [
     "ServoscopeError",
     "Trace",
     "__version__",
+    "assess",
     "design_study",
     "diagnose",
     "init",
@@ -38,6 +40,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from servoscope.assessment.assess import Assessment, assess
     from servoscope.baseline.baseline import Baseline
     from servoscope.core.errors import ServoscopeError
     from servoscope.design import design_study
@@ -57,6 +60,7 @@ if TYPE_CHECKING:
     from servoscope.simulation import simulate
 else:  # hidden from type checkers, which would otherwise accept any name
     _HOMES = {
+        "Assessment": "assessment.assess",
         "Baseline": "baseline.baseline",
         "Columns": "models.loop",
         "Diagnosis": "diagnosis.result",
@@ -66,6 +70,7 @@ else:  # hidden from type checkers, which would otherwise accept any name
         "Recording": "signals.recording",
         "ServoscopeError": "core.errors",
         "Trace": "detection.trace",
+        "assess": "assessment.assess",
         "design_study": "design",
         "diagnose": "diagnosis.diagnose",
         "init": "learning.proposal",

@@ -225,3 +225,19 @@ def test_who_carries_no_covariates_refuses_them(carried: ss.Baseline, tmp_path: 
     assert told.code == 1
     assert "[assets] press.baseline: baseline.json depends on load" in told.err
     assert "name it under [assets.press] nodes.covariates" in told.err
+
+
+def test_a_motion_never_seen_makes_an_alarm_harder_beside_covariates(carried: ss.Baseline) -> None:
+    known, nominal = carry(2.0, 70), carry(2.0, 71)
+    far, _ = simulate(CARRIED, reference("multisine", 30.0, CARRIED.sample_rate, amplitude=3.0), seed=72, **NOISE)
+    far = replace(far, channels=nominal.channels)
+    plain, watched = ss.Monitor(carried), ss.Monitor(carried, motion_check=True)
+    for recording, familiar in ((known, True), (far, False)):
+        signals = recording.r, recording.u, recording.y, recording.restart
+        (_, without), (_, checked) = (
+            monitor.run(monitor.init(), *signals, channels=recording.channels) for monitor in (plain, watched)
+        )
+        assert checked.motion is not None
+        assert (checked.statistic <= without.statistic).all()
+        assert familiar == bool(checked.motion.max() < 0.5)
+        assert familiar or checked.statistic[-1] < 0.1 * without.statistic[-1]

@@ -192,7 +192,7 @@ def test_another_language_replaces_the_wording_and_nothing_else(
     (tmp_path / "en.toml").write_bytes(messages.FOLDER.joinpath("en.toml").read_bytes())
     (tmp_path / "de.toml").write_text(
         '[join]\nor = "{first} oder {last}"\n[diagnosis]\n'
-        'fault = "Fehler{point}: {names:and}. {sizes:and} {since}.{mimic}"\nsince = "seit {t:.1f} s{growth}"\n'
+        'fault = "Fehler{point}: {changes:and} {since}.{mimic}"\nsince = "seit {t:.1f} s{growth}"\n'
         'size = "{parameter} beträgt das {ratio:{digits}}-fache ({low:{digits}} bis {high:{digits}})"\n'
         'second_fault = "Ein zweiter Fehler ({names:or}) erklärt die Aufnahme nicht besser."\n',
         encoding="utf-8",
@@ -201,10 +201,12 @@ def test_another_language_replaces_the_wording_and_nothing_else(
     monkeypatch.setattr(messages, "LANGUAGE", "de")
     catalogue.cache_clear()
     try:
-        assert diagnosis.summary.startswith("Fehler: leakage. C_ie beträgt das 1.19")
-        assert "-fache (1.19" in diagnosis.summary and "seit 30.0 s" in diagnosis.summary
+        assert diagnosis.summary.startswith("Fehler: leakage has risen by a fifth seit 30.0 s.")
+        assert (
+            diagnosis.explanation[0].startswith("C_ie beträgt das 1.19") and "-fache (1.19" in diagnosis.explanation[0]
+        )
         assert "Ein zweiter Fehler (contamination, friction oder pump) erklärt" in " ".join(diagnosis.explanation)
-        assert diagnosis.explanation[0].startswith("Alarm at ")  # English where the language has nothing
+        assert diagnosis.explanation[1].startswith("Alarm at ")  # English where the language has nothing
         assert str(diagnosis.checks[0]).startswith(
             "Kolbendichtung"
         )  # the plant's own words, which it translates itself

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import servoscope as ss
 from servoscope.core.errors import RecordingError
-from servoscope.detection.signal_defects import find_signal_defect
+from servoscope.detection.signal_defects import Correction, begins_wrong, find_signal_defect
 from servoscope.models.loop import Loop
 from servoscope.simulation import FaultEvent, reference, simulate
 
@@ -71,6 +73,34 @@ def test_a_fault_before_a_sensor_sticks_keeps_its_name(machines: dict[str, tuple
 def test_learn_refuses_them(defect: str, words: str) -> None:
     with pytest.raises(RecordingError, match=words):
         ss.learn(loop_of("rig"), [DEFECTS[defect][0](healthy("rig", 1))])
+
+
+def test_a_step_after_the_dead_time_of_the_loop_is_no_counter_that_wraps() -> None:
+    r = np.where(np.arange(2000) // 200 % 2 > 0, 1.0, -1.0)
+    y = np.roll(r, 5) + 1e-3 * np.random.default_rng(1).normal(size=2000)
+    recording = ss.read({"t": np.arange(2000) / 100.0, "r": r, "u": r, "y": y})
+    assert find_signal_defect(recording) is not None
+    assert find_signal_defect(recording, delay_s=0.05) is None
+
+
+def test_a_rest_before_the_command_is_not_counted_as_stuck() -> None:
+    """y rests exactly for three seconds, and breaks away 0.3 s after the command; frozen at 6 s it is stuck."""
+    t = np.arange(1500) / 100.0
+    r = np.where(t < 3.0, 0.0, np.sin(t - 3.0))
+    y = np.where(t < 3.3, 0.0, np.sin(t - 3.3))
+    recording = ss.read({"t": t, "r": r, "u": r, "y": y})
+    assert find_signal_defect(recording) is None
+    defect = find_signal_defect(replace(recording, y=np.where(t < 6.0, y, y[600])))
+    assert defect is not None and defect.begin == 600
+
+
+def test_a_unit_is_wrong_from_the_first_motion_on(machines: dict[str, tuple[ss.Baseline, Recording]]) -> None:
+    learned, recording = machines["rig"]
+    correction = Correction(factors=(1.0, 1.0, 1.0 / 60.0))
+    for begin, wrong in ((0, True), (recording.samples // 2, False)):
+        y = np.where(np.arange(recording.samples) < begin, 1.0, 60.0) * recording.y
+        spoiled = replace(recording, y=y)
+        assert begins_wrong(learned.pipeline(), np.array(learned.theta), spoiled, correction) == wrong
 
 
 @pytest.mark.parametrize("folder", ["qube", "emps", "eha_pump"])

@@ -68,7 +68,7 @@ def test_a_pair_has_both_sizes_and_how_they_hang_together(loop: Loop) -> None:
     diagnosis = make_diagnosis(candidates=(PAIR, NONE), faults=PAIR.faults, probability=0.96, refit=make_refit(NONE))
     page = read(diagnosis, loop)
     for words in (
-        "Pump or valve gain and internal leakage",
+        "pump or valve gain and internal leakage",
         "ps × 0.9000",
         "Cie × 1.2000",
         "sizes correlated by 0.60",

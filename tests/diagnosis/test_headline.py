@@ -38,19 +38,32 @@ def refit(*words: str) -> RefitSummary:
         (
             [candidate(0.99, LEAK)],
             refit("another stiffness of the load"),
-            "Fault: leakage. C_ie is 1.200 times its healthy value (1.190 to 1.210) since 30.0 s. "
-            "Another stiffness of the load would look the same.",
+            "Fault: leakage has risen by a fifth since 30.0 s. Another stiffness of the load would look the same.",
         ),
         (
             [candidate(0.99, INERTIA)],
             refit(),
-            "Fault: inertia. It is 1.0502 times its healthy value (1.0487 to 1.0517) since 30.0 s.",
+            "Fault: inertia has risen by 5 % since 30.0 s.",
         ),
         (
             [candidate(0.99, WEAK, LEAK)],
             refit(),
-            "Fault: pump and leakage. p_s is 0.9000 times its healthy value (0.8980 to 0.9020) and C_ie 1.200 times "
-            "(1.190 to 1.210) since 30.0 s.",
+            "Fault: pump or valve gain has fallen by a tenth and leakage has risen by a fifth since 30.0 s.",
+        ),
+        (
+            [candidate(0.99, STICKY.model_copy(update={"ratio": 4.04, "interval": (3.9, 4.2)}))],
+            refit(),
+            "Fault: friction has risen to 4 times its healthy value since 30.0 s.",
+        ),
+        (  # a size that may be none has no direction
+            [candidate(0.99, LEAK.model_copy(update={"ratio": 0.99, "interval": (0.9, 1.08)}))],
+            refit(),
+            "Fault: leakage has changed by an amount that is not certain since 30.0 s.",
+        ),
+        (
+            [candidate(0.99, GAIN.model_copy(update={"name": "dead zone", "interval": (1.05, 1.15)}))],
+            refit(),
+            "Fault: input_gain (dead zone) has risen by a tenth since 30.0 s.",
         ),
         (
             [candidate(0.99, BACKLASH)],
@@ -67,7 +80,7 @@ def refit(*words: str) -> RefitSummary:
         (
             [candidate(0.73, GAIN), candidate(0.27, INERTIA)],
             None,
-            "Fault since 30.0 s: input_gain (73 %) or inertia (27 %). This recording cannot tell them apart.",
+            "Fault since 30.0 s: input gain (73 %) or inertia (27 %). This recording cannot tell them apart.",
         ),
         (
             [candidate(0.9, LEAK), candidate(0.1)],
@@ -107,7 +120,7 @@ def test_the_onset_as_it_is_known(changes: dict[str, Any], expected: str) -> Non
     sure = candidate(0.99, LEAK)
     interval = FaultInterval(onset_s=(29.0, 30.0, 31.0), faults=sure.faults, candidates=(sure,), **changes)
     headline = str(build_headline("fault", (interval,), {}, (), "warm"))
-    assert headline.startswith("Fault at warm: leakage. ") and headline.endswith(expected)
+    assert headline.startswith("Fault at warm: leakage has risen by a fifth ") and headline.endswith(expected)
 
 
 def test_healthy_and_undetermined() -> None:

@@ -329,7 +329,9 @@ class TestAsset:
         assert followed.state is not None
         status = followed.status(followed.state).to_json()
         (fault,) = status["faults"]
-        assert status["summary"] == status["alarms"]["fault"]["cause"] and "leakage. C_ie is 1.6" in status["summary"]
+        assert (
+            status["summary"] == status["alarms"]["fault"]["cause"] and "leakage has risen by 60 %" in status["summary"]
+        )
         assert fault["ratio"] == told[-1][2] and followed.state.examination.onset == onsets[0]
         assert onsets == [onsets[0]] * 3 and onsets[0] == pytest.approx(BEGAN + 30.0, abs=0.5)
         other = result("fault", document={"faults": [{"name": "pump", "ratio": 0.9}]})
@@ -342,7 +344,7 @@ class TestAsset:
         status = followed.status(followed.state).to_json()
         assert status["verdict"] == "healthy" and status["summary"].startswith("Healthy")
         assert status["alarms"]["fault"]["state"] == "latched_unacknowledged"
-        assert "leakage. C_ie is 1.6" in status["alarms"]["fault"]["cause"]
+        assert "leakage has risen by 60 %" in status["alarms"]["fault"]["cause"]
 
 
 class TestConfig:

@@ -187,7 +187,7 @@ def test_a_fault_is_found_and_sized_at_every_point(
 def test_a_change_that_two_points_explain_is_told_with_both(points: ss.Baseline) -> None:
     said = ss.diagnose(points, record(70, 1.5))
     (warning,) = [w for w in said.warnings if w.kind == "point"]
-    assert said.point == "warm" and "Fault at cold: leakage. C_ie is 1.49" in warning.message
+    assert said.point == "warm" and "Fault at cold: leakage has risen by half" in warning.message
 
 
 def test_a_monitor_follows_one_point(points: ss.Baseline) -> None:
@@ -240,5 +240,9 @@ def test_a_change_is_refused_unless_accepted(folder: Path, tmp_path: Path) -> No
     assert not any("accepted" in str(note) for note in ss.Baseline.load(new).notes)
     assert run("learn", folder / "loop.toml", folder / "leaky.csv", *compare, "--accept-change").code == 0
     (note,) = [str(note) for note in ss.Baseline.load(new).notes if "accepted as healthy" in str(note)]
-    assert "leaky.csv" in note and "C_ie is 1.1" in note and ss.Baseline.load(folder / "old.json").hash in note
+    assert (
+        "leaky.csv" in note
+        and "leakage has risen by a tenth" in note
+        and ss.Baseline.load(folder / "old.json").hash in note
+    )
     assert run("learn", folder / "loop.toml", folder / "b.csv", "-o", new, "--accept-change").code == 2

@@ -16,7 +16,6 @@ from servoscope.core.errors import LoopError
 from servoscope.core.messages import render
 from servoscope.estimation.pipeline import Pipeline
 from servoscope.learning.plant_choice import choose_plant
-from servoscope.learning.proposal import propose
 from servoscope.models.plants.axis import AxisPlant
 from servoscope.simulation import FaultEvent, simulate
 
@@ -129,10 +128,10 @@ class TestSpeed:
         head = "time [s],speed setpoint [rpm],actual speed [rpm],torque [Nm]"
         rows = [f"{t:.4f},{r:.6g},{y:.6g},{u:.6g}" for t, r, y, u in zip(one.t, one.r, one.y, one.u, strict=True)]
         (tmp_path / "drive.csv").write_text("\n".join([head, *rows]), encoding="utf-8")
-        proposal, seen = propose(tmp_path / "drive.csv")
+        proposal = ss.init(tmp_path / "drive.csv")
         assert isinstance(proposal.loop.plant, AxisPlant)
         assert (proposal.loop.plant.y, proposal.loop.plant.terms) == ("speed", ("viscous", "coulomb", "offset"))
-        assert seen.verdict == "usable"
+        assert ss.inspect(tmp_path / "drive.csv", proposal.loop).verdict == "usable"
 
 
 @pytest.mark.slow
@@ -144,7 +143,7 @@ def test_a_payload_is_weighed_and_told_from_friction() -> None:
     assert [fault.name for fault in loaded.faults] == ["payload"]
     mass = loaded.faults[0].mass_kg
     assert mass is not None and mass[0] == pytest.approx(1.0, abs=0.05) and mass[1] < 1.0 + 0.02 and mass[2] > 0.98
-    assert f"payload {mass[0]:+.3g} kg" in render(loaded.headline)
+    assert f"the moved mass has changed by {mass[0]:+.3g} kg" in render(loaded.headline)
     assert json.loads(loaded.model_dump_json())["faults"][0]["mass_kg"] == list(mass)
     assert [fault.name for fault in rough.faults] == ["dry_friction"]
     assert "mass_kg" not in json.loads(rough.model_dump_json())["faults"][0]

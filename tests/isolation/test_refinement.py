@@ -171,6 +171,16 @@ class TestPredictor:
         assert healthy.exact is not None and healthy.exact.misfit < 1.0
 
 
+@pytest.mark.parametrize(("fault", "ratio"), [("C_ie", 5.5), ("C_ie", 10.0), ("p_s", 0.29)])
+def test_a_fault_beyond_its_range_is_no_pair(
+    learned: ss.Baseline, record: Callable[..., ss.Recording], fault: str, ratio: float
+) -> None:
+    """Leakage x 5.5 was 'pump x 0.917 and leakage x 5.000' at probability 1, and x 10 was unknown."""
+    best = refined(learned, record(f"{fault}={ratio}")).best
+    assert best.fitted.names == (fault,) and best.probability > 0.9
+    assert np.exp(best.fitted.x[0]) == pytest.approx(ratio, rel=0.005)
+
+
 def brute(
     window: RefitWindow, names: tuple[str, ...], x: FloatArray, d: FloatArray, growth: ChangeProfile, Q: FloatArray
 ) -> float:

@@ -129,5 +129,5 @@ def test_intervals_survive_json_and_are_printed_one_per_line(stepped: ss.Diagnos
         assert ss.Diagnosis.model_validate_json(diagnosis.model_dump_json()) == diagnosis
         out = io.StringIO()
         print_diagnosis(Console(file=out, width=140), diagnosis)
-        rows = [line for line in out.getvalue().splitlines() if " x " in line and "(" in line and "refit" not in line]
-        assert sum("leakage x" in row or "pump x" in row for row in rows) >= len(diagnosis.intervals)
+        rows = [line for line in out.getvalue().splitlines() if "×" in line and "(" in line]
+        assert sum("leakage ×" in row or "pump ×" in row for row in rows) >= len(diagnosis.intervals)

@@ -27,6 +27,7 @@ WORDS |= {"event", "priority", "unit", "loop", "magic", "baseline", "defect"}
 ADDED = {
     *(
         "checks",
+        "said",
         "headline",
         "reasons",
         "intervals",

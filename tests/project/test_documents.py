@@ -24,6 +24,7 @@ from sources import load
 
 import servoscope as ss
 from servoscope.cli import app
+from servoscope.models.arm.settings import ArmLoop
 from servoscope.models.loop import Loop
 from servoscope.service.config import ServiceFile
 
@@ -41,6 +42,7 @@ RUN = (
 # Python that no page can run, and why: the page shows a part of somebody else's program
 FRAGMENTS = {
     "fleet.md": "the frame is the reader's, in Spark; test_spark.py runs the call",
+    "how-to/robot-arm.md": "the logs are the reader's; test_arm_diagnosis.py makes the calls",
     "how-to/actions.md": "a server of the reader's; test_actions.py checks the signature so",
     "how-to/drive.md": "the image comes from a drive; test_export.py goes there and back",
     "reference/messages.md": "the sender is the reader's; test_payload.py compares with it byte by byte",
@@ -143,6 +145,9 @@ def test_json_is_json(name: str, block: CodeBlock) -> None:
 
 def is_read(settings: dict[str, Any]) -> bool:
     """Read a part of a loop file or of a service file, with what it leaves out; an error names what is wrong."""
+    if settings.get("kind") == "arm":
+        ArmLoop.from_dict(settings, "page")
+        return True
     if settings.keys() <= Loop.model_fields.keys():
         inertia = {"kind": "polynomial", "order": 2, "friction": "coulomb"}
         Loop.from_dict({"sample_rate": 1000.0, "plant": inertia} | settings)

@@ -27,7 +27,7 @@ from servoscope.service.health import serve_health
 from servoscope.service.service import Service
 from servoscope.service.store import Store
 from servoscope.service.store.tables import meta
-from servoscope.service.workers import WorkerPool, _Worker, merge_metrics
+from servoscope.service.workers import WorkerPool, _Follower, merge_metrics
 
 WORKERS = 'listen = "127.0.0.1:0"\nworkers = 2'
 SHARED = {key: query.replace("<> 'hall'", "NOT LIKE 'hall%'") for key, query in halls.RESULTS.items()}
@@ -133,7 +133,7 @@ def test_a_worker_that_loses_its_last_asset_has_nothing_left_to_do(tmp_path: Pat
 
 def test_a_worker_that_ends_while_it_answers_does_not_end_the_others(tmp_path: Path) -> None:
     config = shared_hall(tmp_path, "hall", 0.0)
-    worker = _Worker(ServiceFile.load(config), config, 0, (), ())
+    worker = _Follower(ServiceFile.load(config), config, 0, (), ())
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def answer_half() -> None:
@@ -202,7 +202,7 @@ def test_workers_end_with_their_service(tmp_path: Path) -> None:
 
 def test_a_worker_that_has_not_begun_is_spared_signals_and_begins_anew_once_more(tmp_path: Path) -> None:
     config = shared_hall(tmp_path, "hall", 0.0)
-    worker, sent = _Worker(ServiceFile.load(config), config, 1, ("press",), ()), list[int]()
+    worker, sent = _Follower(ServiceFile.load(config), config, 1, ("press",), ()), list[int]()
     worker.supervisor.send_signal = sent.append  # type: ignore[method-assign]
     assert worker._command()[-2:] == ["--anew", "press"]
     worker.reload()

@@ -65,7 +65,8 @@ def run_page(page: Path, folder: Path, names: dict[str, Any] | None = None) -> i
                     exec(compile("\n" * block.line + block.text, str(page), "exec"), names)  # errors name the line
                 printed = shown.getvalue()
             elif block.kind == "text":
-                same = doctest.OutputChecker().check_output(block.text, printed, FLAGS)
+                plain = printed.replace("\N{NO-BREAK SPACE}", " ")
+                same = doctest.OutputChecker().check_output(block.text, plain, FLAGS)
                 assert same, f"{where}: the page says\n{block.text}\nand this was printed\n{printed}"
             else:
                 continue

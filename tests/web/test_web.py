@@ -118,7 +118,7 @@ def test_live_updates_arrive_until_the_leak_is_told(server: Served, request: pyt
     assert full["asset"] == "press" and "leakage" in str(full["summary"])
     with server.client() as client:
         told = client.get(f"/diagnoses/{full['id']}").json()
-    assert told["document"]["faults"][0]["name"] == "leakage" and told["words"]["leakage"]
+    assert told["document"]["faults"][0]["name"] == "leakage" and told["sections"][1]["title"] == "What to check"
     assert told["units"] == {"r": "m", "u": "A", "y": "m", "response": "A/m"}
 
 

@@ -2,16 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from servoscope.baseline.covariates import CovariateModel
 from servoscope.core.arrays import FloatArray
 from servoscope.estimation.axis_filter import NO_LAG, AxisNoise, DriveLag
 from servoscope.models.plants import Fault
 from servoscope.models.plants.axis import BY_DIRECTION, AxisPlant
+
+
+class AxisMoves(BaseModel):
+    """How covariates move the coefficients of an axis along a recording."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    covariates: CovariateModel
+    names: tuple[str, ...]  # of the coefficients that its slopes are about
+
+    def factors(self, plant: AxisPlant, channels: Mapping[str, FloatArray]) -> FloatArray:
+        """Return what multiplies u and the terms in ``y'' = b u - sum a_i column_i``, shape (1 + terms, N)."""
+        along = dict(zip(self.names, self.covariates.factors(channels).T, strict=True))
+        inertia = along["inertia"]
+        return np.array([1.0 / inertia, *(along[column.coefficient] / inertia for column in plant.acting)])
 
 
 class AxisModel(BaseModel):
@@ -36,6 +52,8 @@ class AxisModel(BaseModel):
     change_limit: float = 0.0
     # the same for the squared t statistic of a vibration that begins within a recording
     vibration_limit: float = 0.0
+    # what covariates do to the coefficients, which are those of the middle of the learned range then
+    moves: AxisMoves | None = Field(default=None, exclude_if=lambda moves: moves is None)
 
     def scatter(self, names: Sequence[str]) -> FloatArray:
         """Return the standard deviations of coefficients between recordings, shape (len(names),)."""
@@ -47,6 +65,13 @@ class AxisModel(BaseModel):
         """Return those faults that multiply something that the healthy recordings show."""
         both = {"viscous_friction": BY_DIRECTION} if "viscous_friction" not in self.coefficients else {}
         return tuple(one for one in faults if not set(both.get(one.parameter, (one.parameter,))) <= set(self.unseen))
+
+    def at(self, factors: Mapping[str, float], shifts: Mapping[str, float]) -> AxisModel:
+        """Return the axis at some covariates: coefficients multiplied or, where no factor is known, shifted."""
+        moved = {
+            name: value * factors.get(name, 1.0) + shifts.get(name, 0.0) for name, value in self.coefficients.items()
+        }
+        return self.model_copy(update={"coefficients": moved, "moves": None})
 
     def plant(self, declared: AxisPlant) -> AxisPlant:
         """Return the plant of the loop file with these coefficients."""

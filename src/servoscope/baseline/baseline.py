@@ -44,6 +44,7 @@ from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
 
 FORMAT = "servoscope-baseline"
+ARM_FORMAT = "servoscope-arm-baseline"  # what `ArmBaseline` writes
 VERSION = 3
 
 
@@ -73,6 +74,11 @@ class Baseline(ShortRepr, BaselineMemory):
     point, others
         Name of the operating point, empty where none was declared; the baselines of the other points. A baseline with
         others is itself that of the first point.
+
+    Examples
+    --------
+    >>> Baseline.load("baseline.json").names
+    ('viscous_friction', 'inertia', 'coulomb_friction', 'offset')
     """
 
     loop_settings: dict[str, Any] = Field(alias="loop")
@@ -176,6 +182,7 @@ class Baseline(ShortRepr, BaselineMemory):
         covariance = self.covariance_array() + model.theta_covariance(origin, c)
         update: dict[str, Any] = {"theta": tuple(theta.tolist()), "covariance": tuple(map(tuple, covariance.tolist()))}
         update["covariates"] = None
+        update["features"] = None if self.features is None else self.features.at(c)
         moved: dict[str, Any] = {}
         if self.healthy.theta:
             moved["theta"] = tuple((np.array(self.healthy.theta) + theta - origin).tolist())
@@ -184,9 +191,11 @@ class Baseline(ShortRepr, BaselineMemory):
             moved["ratios"] = match_ratios(self.loop, self.healthy.ratios, wanted, covariance)
         update["healthy"] = self.healthy.model_copy(update=moved)
         if self.axis is not None:
-            shift = dict(zip(self.names, (theta - origin).tolist(), strict=True))
-            coefficients = {name: value + shift.get(name, 0.0) for name, value in self.axis.coefficients.items()}
-            update["axis"] = self.axis.model_copy(update={"coefficients": coefficients})
+            moves = list(zip(self.names, model.proportional, theta.tolist(), origin.tolist(), strict=True))
+            update["axis"] = self.axis.at(
+                {name: value / middle for name, proportional, value, middle in moves if proportional},
+                {name: value - middle for name, proportional, value, middle in moves if not proportional},
+            )
         return self.model_copy(update=update)
 
     @property
@@ -308,6 +317,8 @@ class Baseline(ShortRepr, BaselineMemory):
             raise BaselineError(
                 f"{path}: is not a baseline (no JSON); give the file that servoscope learn wrote"
             ) from None
+        if isinstance(content, Mapping) and content.get("format") == ARM_FORMAT:
+            raise BaselineError(f"{path}: baseline of an arm, which diagnose takes, and no other command")
         if not isinstance(content, Mapping) or content.get("format") != FORMAT:
             raise BaselineError(f"{path}: is not a baseline; give the file that servoscope learn wrote")
         version = content.get("version")

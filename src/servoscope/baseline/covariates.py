@@ -70,6 +70,11 @@ class CovariateModel(BaseModel):
         g = self.basis(c) @ np.array(self.slopes)
         return np.asarray(np.where(self.proportional, theta * np.exp(g), theta + g))
 
+    def factors(self, channels: Mapping[str, FloatArray]) -> FloatArray:
+        """Return by what each coefficient is multiplied along a recording, shape (N, n); 1 where not `proportional`."""
+        values = self.clip(CovariatePath.of(self, np.zeros(len(self.proportional)), channels, 1.0).values)
+        return np.asarray(np.where(self.proportional, np.exp(self.basis(values) @ np.array(self.slopes)), 1.0))
+
     def theta_covariance(self, theta: FloatArray, c: FloatArray) -> FloatArray:
         """Return what the uncertain slopes make of the coefficients at covariates (..., k), shape (..., n, n)."""
         G, n = self.basis(c), len(theta)

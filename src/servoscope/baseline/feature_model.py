@@ -1,14 +1,18 @@
 """What healthy recordings show in their features: scatter between recordings and within them, and how far off one is.
 
-Recordings are drawn from a population: the mean of a recording's m windows scatters with S_b + S_w/m. With n recordings
-S_m, the covariance of their means around a line over their order, is shrunk towards the shape of S_w, the covariance of
-windows within recordings (oracle approximating shrinkage; Chen, Wiesel, Eldar, Hero, 2010):
+Recordings are drawn from a population: the mean of a recording's m windows scatters with S_b + S_w/m. The means of n
+recordings are regressed on x = (1, t, c): their order t, for healthy machines drift, and their covariates c, where
+those are logged. S_m, the covariance of what is left with n - p degrees of freedom, is shrunk towards the shape of S_w,
+the covariance of windows within recordings (oracle approximating shrinkage; Chen, Wiesel, Eldar, Hero, 2010):
 
-    S = ((n - 2) S_m + nu k S_w)/(n - 2 + nu),  k = tr S_m/tr S_w
-    C = S (1 + 1/n + n^2/t't) + (n b)(n b)' + S_w max(1/m - 1/m_n, 0)
+    S = ((n - p) S_m + nu k S_w)/(n - p + nu),  k = tr S_m/tr S_w
+    C = S (1 + x' (X'X)^-1 x) + (n b)(n b)' + S_w max(1/m - 1/m_n, 0)
 
-which predicts a recording n places after the middle of those learned, b the slope over the order and t the order
-itself: healthy machines drift. The statistic is the largest T^2/d over groups of features that belong together.
+which predicts a recording n places after the middle of those learned, b the slope over the order. The statistic is the
+largest T^2/d over groups of features that belong together.
+
+A recording is compared with its own past too: the means of its later windows less those of its earlier ones, beside
+those differences in healthy recordings. What differs from day to day hides nothing then.
 """
 
 from __future__ import annotations
@@ -18,15 +22,18 @@ from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
+from servoscope.baseline.feature_spans import NO_COVARIATES, SpanFeatures
 from servoscope.baseline.threshold import FEATURE_SHARE, SECONDS_PER_YEAR
-from servoscope.core.arrays import FloatArray, IndexArray
+from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.estimation.window_features import MOTIONS, SIGNALS, FeatureLayout, Window
 
 PRIOR_DEGREES = 12.0  # degrees of freedom of the shape of S_w behind S
 SCORE_STD = 0.5  # of the logarithm of healthy scores, expected before any was seen
 SCORE_PRIOR = 8.0  # degrees of freedom of that expectation
+# of the learned range, by which a covariate may be outside of it: the limit widens with the distance
+MAX_EXTRAPOLATION_SHARE = 0.2
 WIDENING_SHARE = 0.5  # share by which the healthy range of motion is widened either way
 MIN_WIDENING = 0.05  # and by how much at least: of a share of time, of a logarithm of speed
 
@@ -47,6 +54,15 @@ class FeatureGroup(_FeatureRecord):
     within: Matrix  # covariance of windows around the mean of their recording, shape (k, k)
     degrees: int  # of freedom behind `within`
     windows: float  # per recording, on average
+    # covariates of each recording, shape (n, k)
+    covariates: Matrix = Field(default=(), exclude_if=lambda value: not value)
+    # whether the features are later windows less earlier ones of the same recording
+    past: bool = Field(default=False, exclude_if=lambda value: not value)
+
+    def pick(self, span: SpanFeatures) -> tuple[FloatArray, float]:
+        """Return the features of a span that the group is about, shape (k,), and how many windows they are worth."""
+        values, counts = (span.shift, span.shift_counts) if self.past else (span.values, span.counts)
+        return values[self.level, list(self.kept)], float(counts[self.level])
 
 
 class FeatureModel(_FeatureRecord):
@@ -60,6 +76,14 @@ class FeatureModel(_FeatureRecord):
     limit: float  # of the score
     false_alarms: float  # share of healthy spans that exceed it
     in_a_row: int  # spans above the limit until a running monitor raises the alarm
+    covariates: tuple[str, ...] = Field(default=(), exclude_if=lambda value: not value)  # names of the k covariates
+    # of the score against the recording's own past; 0 where recordings are not compared with it
+    past_limit: float = Field(default=0.0, exclude_if=lambda value: not value)
+
+    @property
+    def compares_past(self) -> bool:
+        """Whether recordings are compared with their own past."""
+        return self.past_limit > 0.0
 
     @property
     def recordings(self) -> int:
@@ -71,24 +95,42 @@ class FeatureModel(_FeatureRecord):
         in_a_row = spans_in_a_row(self.layout, self.false_alarms, false_alarms_per_year)
         return self.model_copy(update={"in_a_row": in_a_row})
 
+    def at(self, covariates: FloatArray) -> Self:
+        """Return the model at some covariates (k,), which recordings need not have then."""
+        if not self.covariates:
+            return self
+        groups = [one.at(covariates) for one in self.statistics]
+        # anew: a copy would keep the statistics of these groups
+        return type(self).model_validate(self.model_dump() | {"groups": tuple(groups), "covariates": ()})
+
     @cached_property
     def statistics(self) -> tuple[GroupStatistic, ...]:
         """What scores each group."""
         return tuple(GroupStatistic.of(group) for group in self.groups)
 
-    def score(self, span: SpanFeatures) -> float:
-        """Return the largest T^2/d over the groups; NaN where the motion is none that healthy recordings show."""
-        return max(self.scores(span)) if self.is_familiar(span) else float("nan")
+    def ratio(self, span: SpanFeatures) -> float:
+        """Return the largest score over its limit; NaN where healthy recordings do not move like this."""
+        return max(self.ratios(span)) if self.is_familiar(span) else float("nan")
 
-    def scores(self, span: SpanFeatures) -> list[float]:
-        """Return T^2/d of each group."""
-        return [one.score(span.values[one.level], span.counts[one.level]) for one in self.statistics]
+    def ratios(self, span: SpanFeatures) -> list[float]:
+        """Return T^2/d of each group over its limit."""
+        return [
+            one.score(*one.group.pick(span), span.covariates) / (self.past_limit if one.group.past else self.limit)
+            for one in self.statistics
+        ]
 
     def is_familiar(self, span: SpanFeatures) -> bool:
-        """Return whether healthy recordings moved like this; what they never showed is no evidence."""
+        """Return whether healthy recordings moved like this, at such covariates; what is unknown is no evidence."""
         seen = np.isfinite(span.motion)
         low, high = np.array(self.motion_low), np.array(self.motion_high)
-        return bool(((span.motion >= low) & (span.motion <= high))[seen].all())
+        moved = bool(((span.motion >= low) & (span.motion <= high))[seen].all())
+        return moved and (not self.covariates or self._is_near(span.covariates))
+
+    def _is_near(self, covariates: FloatArray) -> bool:
+        learned = np.array(self.groups[0].covariates)
+        low, high = learned.min(axis=0), learned.max(axis=0)
+        edge = MAX_EXTRAPOLATION_SHARE * (high - low)
+        return bool(((covariates >= low - edge) & (covariates <= high + edge)).all())
 
     def conformal_p_value(self, span: SpanFeatures) -> float:
         """Return how often a further healthy recording would be as unlike the others, whatever their distribution.
@@ -99,110 +141,90 @@ class FeatureModel(_FeatureRecord):
         """
         n = self.recordings
         scores = np.zeros(n + 1)
-        for group in self.groups:
-            values = np.vstack([np.array(group.means), span.values[group.level][list(group.kept)]])
+        for group in (group for group in self.groups if not group.past):
+            new, _ = group.pick(span)
+            values = np.vstack([np.array(group.means), new])
             if not np.isfinite(values).all():
                 continue
+            c = np.vstack([np.array(group.covariates).reshape(n, -1), span.covariates[: len(self.covariates)]])
             for i in range(n + 1):
-                others = group.model_copy(update={"means": np.delete(values, i, axis=0)})
-                one = GroupStatistic.of(others, drift=False, features=np.arange(values.shape[1]))
-                scores[i] = max(scores[i], one.score(values[i], group.windows))
+                others = group.model_copy(
+                    update={"means": np.delete(values, i, axis=0), "covariates": np.delete(c, i, axis=0)}
+                )
+                one = GroupStatistic.of(others, drift=False)
+                scores[i] = max(scores[i], one.score(values[i], group.windows, c[i]))
         return float((scores >= scores[-1]).sum()) / (n + 1.0)
 
 
-class SpanFeatures(NamedTuple):
-    """Mean features of a span of windows, per level: values (levels, d), windows (levels,), motion (5,)."""
-
-    values: FloatArray
-    counts: FloatArray
-    motion: FloatArray
-
-    @classmethod
-    def of(cls, windows: Sequence[Window], layout: FeatureLayout) -> SpanFeatures:
-        """Average windows."""
-        sums = SpanSums(layout)
-        for window in windows:
-            sums.add(window)
-        return sums.mean()
-
-
-class SpanSums:
-    """Adds up windows in one array of numbers, `state`, which may be one that somebody else keeps."""
-
-    def __init__(self, layout: FeatureLayout, state: FloatArray | None = None) -> None:
-        d, levels = layout.size, layout.levels
-        self.state = np.zeros(self.size_of(layout)) if state is None else state
-        self.counts = self.state[:levels]
-        self._motion = self.state[levels : levels + 10].reshape(2, 5)
-        self._values = self.state[levels + 10 :].reshape(2, levels, d)
-
-    @staticmethod
-    def size_of(layout: FeatureLayout) -> int:
-        """Return the size of the state."""
-        return layout.levels * (1 + 2 * layout.size) + 10
-
-    def add(self, window: Window) -> None:
-        """Add a window; what it does not show does not count."""
-        self.counts[window.level] += 1.0
-        for sums, values in ((self._values[:, window.level], window.features), (self._motion, window.motion)):
-            if sums is self._motion and window.level:
-                continue
-            seen = np.isfinite(values)
-            sums[0][seen] += values[seen]
-            sums[1] += seen
-
-    def mean(self) -> SpanFeatures:
-        """Return the means; NaN where nothing was seen."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            values, motion = (one[0] / one[1] for one in (self._values, self._motion))
-        return SpanFeatures(values, self.counts.copy(), motion)
-
-
 class GroupStatistic(NamedTuple):
-    """T^2/d of a group of features: centre, scale and covariances in standard deviations."""
+    """T^2/d of a group of features, in their scale: regression on x = (1, t, c), and what is left of it."""
 
-    level: int
-    kept: IndexArray
-    centre: FloatArray
+    group: FeatureGroup
+    centre: FloatArray  # features at the middle of the order and of the covariates, shape (k,)
     scale: FloatArray
-    predicted: FloatArray  # C for as many windows as the healthy recordings hold
+    slopes: FloatArray  # per unit of each covariate, shape (number of covariates, k)
+    middle: FloatArray  # of each covariate
+    gram: FloatArray  # (X'X)^-1
+    ahead: FloatArray  # x of a further recording, at the middle of the covariates
+    between: FloatArray  # S
+    drift: FloatArray  # (n b)(n b)'
     within: FloatArray  # S_w
-    windows: float
 
     @classmethod
-    def of(cls, group: FeatureGroup, drift: bool = True, features: IndexArray | None = None) -> GroupStatistic:
+    def of(cls, group: FeatureGroup, drift: bool = True) -> GroupStatistic:
         """Prepare a group; without `drift`, the order of the recordings does not count."""
         M, W = np.array(group.means), np.array(group.within)
-        n = len(M)
-        centre = M.mean(axis=0)
+        n, drift = len(M), drift and not group.past
+        c = np.array(group.covariates).reshape(n, -1)
+        centre, middle = M.mean(axis=0), c.mean(axis=0)
         scale = np.sqrt(np.diag(W) + M.var(axis=0, ddof=1))
         scale = np.where(scale > 0.0, scale, np.maximum(np.abs(centre), 1.0))
         Z, within = (M - centre) / scale, shrink(W / np.outer(scale, scale), group.degrees)
-        t = np.arange(n) - (n - 1.0) / 2.0
-        tt = float(t @ t)
-        slope = t @ Z / tt if drift else np.zeros(len(centre))
-        rest, dof = Z - np.outer(t, slope), n - 2.0 if drift else n - 1.0
-        between = rest.T @ rest / dof
+        order = np.arange(n)[:, None] - (n - 1.0) / 2.0
+        X = np.hstack([np.ones((n, 1)), order if drift else order[:, :0], c - middle])
+        gram = np.linalg.pinv(X.T @ X)
+        B = gram @ X.T @ Z
+        rest, dof = Z - X @ B, max(n - float(X.shape[1]), 1.0)
+        left = rest.T @ rest / dof
         # recordings of one window say nothing of the shape: no feature then goes with another
         shape = within if np.trace(within) > 0.0 else np.eye(len(centre))
-        ratio = float(np.trace(between) / np.trace(shape))
-        S = (dof * between + PRIOR_DEGREES * ratio * shape) / (dof + PRIOR_DEGREES)
-        ahead = n * n / tt if drift else 0.0
-        C = S * (1.0 + 1.0 / n + ahead) + n * n * np.outer(slope, slope) + 1e-9 * np.eye(len(centre))
-        kept = np.array(group.kept) if features is None else features
-        return cls(group.level, kept, centre, scale, C, within, group.windows)
+        ratio = float(np.trace(left) / np.trace(shape))
+        S = (dof * left + PRIOR_DEGREES * ratio * shape) / (dof + PRIOR_DEGREES)
+        moved = n * B[1] if drift else np.zeros(len(centre))
+        ahead = np.array([1.0, *([n] if drift else []), *np.zeros(c.shape[1])])
+        slopes = B[X.shape[1] - c.shape[1] :]
+        return cls(group, centre, scale, slopes, middle, gram, ahead, S, np.outer(moved, moved), within)
 
-    def deviations(self, values: FloatArray) -> FloatArray:
+    def predicted(self, covariates: FloatArray) -> FloatArray:
+        """Return C for as many windows as the healthy recordings hold, at some covariates, in the scale."""
+        x = self.ahead.copy()
+        x[len(x) - len(self.middle) :] = covariates[: len(self.middle)] - self.middle
+        return np.asarray(self.between * (1.0 + x @ self.gram @ x) + self.drift + 1e-9 * np.eye(len(self.centre)))
+
+    def expected(self, covariates: FloatArray) -> FloatArray:
+        """Return the features of a healthy recording at some covariates, shape (k,)."""
+        off = (covariates[: len(self.middle)] - self.middle) @ self.slopes
+        return np.asarray(self.centre + self.scale * off)
+
+    def at(self, covariates: FloatArray) -> FeatureGroup:
+        """Return the group as if all healthy recordings had been at some covariates."""
+        if self.group.past:
+            return self.group
+        moved = (np.array(self.group.covariates) - covariates) @ self.slopes * self.scale
+        return self.group.model_copy(update={"means": to_tuples(np.array(self.group.means) - moved), "covariates": ()})
+
+    def deviations(self, values: FloatArray, covariates: FloatArray = NO_COVARIATES) -> FloatArray:
         """Return how far off each of the group's features is, in standard deviations between recordings."""
-        return np.asarray((values[self.kept] - self.centre) / (self.scale * np.sqrt(np.diag(self.predicted))))
+        spread = self.scale * np.sqrt(np.diag(self.predicted(covariates)))
+        return np.asarray((values - self.expected(covariates)) / spread)
 
-    def score(self, values: FloatArray, windows: float) -> float:
-        """Return T^2/d of features that are the mean of some windows; 0 where none of them was seen."""
-        z = (values[self.kept] - self.centre) / self.scale
+    def score(self, values: FloatArray, windows: float, covariates: FloatArray = NO_COVARIATES) -> float:
+        """Return T^2/d of features (k,) that are the mean of some windows; 0 where none of them was seen."""
+        z = (values - self.expected(covariates)) / self.scale
         seen = np.isfinite(z)
         if not seen.any() or not windows > 0.0:
             return 0.0
-        C = self.predicted + self.within * max(1.0 / windows - 1.0 / self.windows, 0.0)
+        C = self.predicted(covariates) + self.within * max(1.0 / windows - 1.0 / self.group.windows, 0.0)
         return float(z[seen] @ np.linalg.solve(C[np.ix_(seen, seen)], z[seen])) / int(seen.sum())
 
 
@@ -215,9 +237,14 @@ def shrink(S: FloatArray, degrees: int) -> FloatArray:
     return (1.0 - weight) * S + weight * mean * np.eye(p)
 
 
-def fit_groups(recordings: Sequence[Sequence[Window]], layout: FeatureLayout) -> tuple[FeatureGroup, ...]:
-    """Return the groups of features of healthy recordings, each given by its windows."""
-    means = [SpanFeatures.of(windows, layout).values for windows in recordings]
+def fit_groups(
+    recordings: Sequence[Sequence[Window]],
+    spans: Sequence[Sequence[SpanFeatures]],
+    layout: FeatureLayout,
+    covariates: Matrix = (),
+) -> tuple[FeatureGroup, ...]:
+    """Return the groups of features of healthy recordings, each given by its windows, spans and covariates."""
+    means = np.array([SpanFeatures.of(windows, layout).values for windows in recordings])
     found = []
     for level in range(layout.levels):
         rows = [np.array([w.features for w in windows if w.level == level]) for windows in recordings]
@@ -225,24 +252,39 @@ def fit_groups(recordings: Sequence[Sequence[Window]], layout: FeatureLayout) ->
             continue
         for part in layout.groups:
             columns = np.arange(layout.size)[part]
-            kept = columns[np.isfinite([mean[level, part] for mean in means]).all(axis=0)]
+            kept = columns[np.isfinite(means[:, level, part]).all(axis=0)]
             if not len(kept):
                 continue
-            M = np.array([mean[level, kept] for mean in means])
+            M = means[:, level, kept]
             apart = np.concatenate([each[:, kept] - mean for each, mean in zip(rows, M, strict=True)])
             apart = np.where(np.isfinite(apart), apart, 0.0)
             degrees = max(len(apart) - len(M), 1)
-            found.append(
-                FeatureGroup(
-                    level=level,
-                    kept=tuple(kept.tolist()),
-                    means=tuple(map(tuple, M.tolist())),
-                    within=tuple(map(tuple, (apart.T @ apart / degrees).tolist())),
-                    degrees=degrees,
-                    windows=len(apart) / len(M),
-                )
+            group = FeatureGroup(
+                level=level,
+                kept=tuple(kept.tolist()),
+                means=to_tuples(M),
+                within=to_tuples(apart.T @ apart / degrees),
+                degrees=degrees,
+                windows=len(apart) / len(M),
+                covariates=covariates,
             )
+            found.append(group)
+            if (past := _own_past(group, spans)) is not None:
+                found.append(past)
     return tuple(found)
+
+
+def _own_past(group: FeatureGroup, spans: Sequence[Sequence[SpanFeatures]]) -> FeatureGroup | None:
+    """Return the group of the same features, later windows less earlier ones; None where recordings show none."""
+    past = group.model_copy(update={"past": True, "covariates": ()})
+    picked = [[past.pick(span) for span in each if span.shift.size] for each in spans]
+    if not all(picked):
+        return None
+    means = np.array([np.mean([values for values, _ in each], axis=0) for each in picked])
+    worth = float(np.mean([sum(count for _, count in each) for each in picked]))
+    if not np.isfinite(means).all() or not worth > 0.0:
+        return None
+    return past.model_copy(update={"means": to_tuples(means), "windows": worth})
 
 
 def score_limit(left_out: Sequence[float], false_alarms: float) -> float:

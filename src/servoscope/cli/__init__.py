@@ -7,6 +7,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from servoscope.cli import (  # their commands add themselves to the application
     alarms,
+    assess,
     bench,
     export,
     fleet,
@@ -25,6 +26,7 @@ group_commands()
 __all__ = [
     "alarms",
     "app",
+    "assess",
     "bench",
     "export",
     "fleet",

@@ -1,6 +1,7 @@
 """An example of each command, which its ``--help`` ends with."""
 
 EXAMPLES = {
+    "assess": "servoscope assess loops --csv worst.csv",
     "demo": "servoscope demo -o demo",
     "tutorial": "servoscope tutorial -o tutorial",
     "init": "servoscope init monday.csv --columns 'u=Current' -o loop.toml",

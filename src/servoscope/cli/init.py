@@ -93,7 +93,6 @@ def _propose(out: Console, logs: list[Path], columns: Columns, output: Path, ask
     """Print the proposal for logs with its evidence, write it, and inspect the logs with it."""
     from servoscope.cli.render import results
     from servoscope.core.errors import ServoscopeError
-    from servoscope.core.files import atomic_write
     from servoscope.core.messages import render
     from servoscope.learning import inspection
     from servoscope.learning.proposal import propose_loop
@@ -114,7 +113,7 @@ def _propose(out: Console, logs: list[Path], columns: Columns, output: Path, ask
     results.print_notes(out, notes)
     if asks and any(line.doubtful for line in proposal.lines):
         typer.confirm(say("init.confirm"), default=True, abort=True)
-    atomic_write(output, proposal.to_toml(logs[0].name).encode())
+    proposal.save(output)
     results.print_written_path(out, output)
     usable = []
     for log in logs:

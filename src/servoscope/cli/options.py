@@ -71,6 +71,10 @@ class ReadingOptions:
     from_s: FromOption = None
     to_s: ToOption = None
 
+    def given(self) -> dict[str, object]:
+        """Return the options by what they are called on the command line."""
+        return {f"--{name.removesuffix('_s').replace('_', '-')}": value for name, value in vars(self).items()}
+
 
 def with_reading_options(*left_out: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command the options of `ReadingOptions`, in the place of its parameter ``reading``, but for some."""

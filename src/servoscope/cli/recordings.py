@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servoscope.cli import arguments
+from servoscope.cli import arguments, arm
 from servoscope.cli.app import app
 from servoscope.cli.arguments import RecordingReader
 from servoscope.cli.exit import EXIT_FAULT, EXIT_INPUT, FailureCounter, print_json
@@ -130,9 +130,16 @@ def learn(
     from servoscope.cli.render import results
     from servoscope.diagnosis import operating_points
     from servoscope.learning.learn import nominal_baseline
+    from servoscope.models.arm.settings import describes_arm
     from servoscope.models.loop import Loop
     from servoscope.report import plain_values
 
+    if describes_arm(loop):
+        points = any(point for point, _ in named)
+        options = {"--nominal": nominal, "--compare": compare, "--fault": fault, "--population": population}
+        arm.refuse_options({**options, "operating points": points, **reading.given()})
+        arm.learn_baseline(loop, [path for _, path in named], output, as_json)
+        return
     settings = Loop.load(loop)
     reader = RecordingReader.from_options(settings, reading)
     if reader.columns is not None:  # they become part of the baseline, so that diagnose need not be told again
@@ -199,14 +206,19 @@ def diagnose(
     check_output(report, "--report", REPORTS, inputs, folder=True)
     check_output(trace, "--trace", TRACES, inputs, folder=True)
 
+    from servoscope.baseline.arm import ArmBaseline
     from servoscope.baseline.baseline import Baseline
     from servoscope.cli.render import diagnosis, results
     from servoscope.diagnosis.diagnose import diagnose as diagnose_recording
     from servoscope.diagnosis.diagnose import diagnose_with_trace
     from servoscope.diagnosis.verify import provenance
-    from servoscope.report import plain_values, write_diagnosis_page
+    from servoscope.report import document, plain_values, write_diagnosis_page
     from servoscope.signals.writers import write_table
 
+    if (of_arm := ArmBaseline.load(baseline)) is not None:
+        arm.refuse_options({"--point": point, "--trace": trace, **reading.given()})
+        arm.diagnose_logs(of_arm, recordings, as_json, report, fail_on_fault, details)
+        return
     whole = learned = Baseline.load(baseline)
     if point is not None:
         learned = whole.at(point)
@@ -233,7 +245,9 @@ def diagnose(
                             if as_json:
                                 print_json(plain_values.to_plain_values(result), lines=several)
                             else:
-                                diagnosis.print_diagnosis(out, result, details)
+                                diagnosis.print_diagnosis(
+                                    out, result, document.DETAILS if details else document.EVIDENCE
+                                )
                         stem = recording_stem(path, recording.name)
                         if traces is not None and course is not None:
                             target = traces.path(stem)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +27,18 @@ def fill_channels(
     """Return channels, shape (N,) each, at times that end at 0, with what is known of those without any value."""
     absent = {name for name in history if name not in channels or not np.isfinite(channels[name]).any()}
     return {**channels, **{name: np.interp(before_s, *history[name]) for name in history if name in absent}}
+
+
+def read_channels(
+    names: Sequence[str], channels: Mapping[str, npt.ArrayLike], shape: tuple[int, ...]
+) -> dict[str, FloatArray]:
+    """Return the covariates of a block, NaN where there is no number; raise RecordingError where one is missing."""
+    if (missing := next((name for name in names if name not in channels), None)) is not None:
+        raise RecordingError(str(message("covariate.missing", covariate=missing)))
+    found = {name: np.asarray(channels[name], dtype=np.float64) for name in names}
+    if any(channel.shape != shape for channel in found.values()):
+        raise RecordingError("covariates must have the shape of r")
+    return {name: np.where(np.isfinite(channel), channel, np.nan) for name, channel in found.items()}
 
 
 class CovariateMonitor:
@@ -56,12 +68,7 @@ class CovariateMonitor:
         Once, as soon as all are known, the coefficients (n,) to start from come too. An average is NaN before the first
         value, and where the newest value is too old.
         """
-        found = {name: np.asarray(channel, dtype=np.float64) for name, channel in channels.items()}
-        found = {name: np.where(np.isfinite(channel), channel, np.nan) for name, channel in found.items()}
-        if (missing := next((name for name in self.model.names if name not in found), None)) is not None:
-            raise RecordingError(str(message("covariate.missing", covariate=missing)))
-        if any(found[name].shape != signals[0].shape for name in self.model.names):
-            raise RecordingError("covariates must have the shape of r")
+        found = read_channels(self.model.names, channels, signals[0].shape)
         of_average, age = np.split(state, [self.average.size])
         began, values = not np.isnan(of_average).any(), self.model.values(found)
         averages = self.average.run(of_average, values)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
 from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
 
-from servoscope.baseline.feature_model import FeatureModel, SpanFeatures, SpanSums
+from servoscope.baseline.feature_model import FeatureModel
+from servoscope.baseline.feature_spans import SpanFeatures, SpanSums
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.estimation.window_features import Window, WindowFeatures, WindowLanes
+
+NO_CHANNELS: Mapping[str, FloatArray] = {}
 
 
 class SpanScore(NamedTuple):
@@ -26,14 +29,18 @@ class SpanScore(NamedTuple):
 class FeatureMonitor:
     """Scores the spans of one loop; its state is one array of numbers, changed in place.
 
-    The state holds the newest scores, as many as must be above the limit in a row, then the span that runs, then the
-    window that runs.
+    The state holds the newest scores, as many as must be above the limit in a row, then of covariates, if there are
+    any, the samples so far and sums and numbers of those in the span that runs, then that span, then the window that
+    runs.
     """
 
     def __init__(self, model: FeatureModel) -> None:
         self.model = model
         self.windows = WindowFeatures(model.layout)
-        self.head = model.in_a_row + SpanSums.size_of(model.layout)  # numbers of the state before the window that runs
+        k = len(model.covariates)
+        self._sums = model.in_a_row + (1 + 2 * k if k else 0)  # numbers of the state before the span that runs
+        # and before the window that runs
+        self.head = self._sums + SpanSums.size_of(model.layout, model.compares_past)
         self.size = self.head + self.windows.size
 
     def start(self) -> FloatArray:
@@ -41,42 +48,76 @@ class FeatureMonitor:
         return np.concatenate([np.zeros(self.head), self.windows.start()])
 
     def run(
-        self, state: FloatArray, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray
+        self,
+        state: FloatArray,
+        r: FloatArray,
+        u: FloatArray,
+        y: FloatArray,
+        restart: BoolArray,
+        channels: Mapping[str, FloatArray] = NO_CHANNELS,
     ) -> list[SpanScore]:
         """Feed a block of samples, each of shape (N,), and return the spans that ended in it."""
-        return self.score(state, self.windows.run(state[self.head :], r, u, y, restart))
+        return self.score(state, self.windows.run(state[self.head :], r, u, y, restart), channels)
 
-    def score(self, state: FloatArray, windows: Iterable[Window]) -> list[SpanScore]:
-        """Add windows to the span that runs, and return the spans that ended with one of them."""
+    def score(
+        self, state: FloatArray, windows: Iterable[Window], channels: Mapping[str, FloatArray] = NO_CHANNELS
+    ) -> list[SpanScore]:
+        """Add windows to the span that runs, and return the spans that ended with one of them.
+
+        `channels`: the covariates at the samples of the block, NaN where one has no value.
+        """
         sums, scores, found = self._span(state), state[: self.model.in_a_row], []
+        values = np.array([channels[name] for name in self.model.covariates], dtype=np.float64)
+        begin = 0
         for end, ended in groupby(windows, key=lambda window: window.end):
             for window in ended:
                 sums.add(window)
             if sums.counts[0] < self.model.layout.span:
                 continue
-            span = sums.mean()
+            if values.size:
+                last = end - int(state[self.model.in_a_row])
+                self._add_covariates(state, values[:, begin:last])
+                begin = last
+            span = self._mean(state)
             sums.state[:] = 0.0
-            ratio = self.model.score(span) / self.model.limit
-            if np.isfinite(ratio):  # unfamiliar motion neither raises nor clears
+            state[self.model.in_a_row + 1 : self._sums] = 0.0
+            ratio = self.model.ratio(span)
+            if np.isfinite(ratio):  # what is unfamiliar neither raises nor clears
                 scores[:-1] = scores[1:].copy()
                 scores[-1] = ratio
             found.append(SpanScore(end, ratio, self.value(state), span))
+        if values.size:
+            self._add_covariates(state, values[:, begin:])
+            state[self.model.in_a_row] += values.shape[1]
         return found
+
+    def _add_covariates(self, state: FloatArray, values: FloatArray) -> None:
+        """Add values (k, N), one after the other, whatever the blocks: pairwise sums would differ in the last bit."""
+        sums = state[self.model.in_a_row + 1 : self._sums].reshape(2, -1)
+        known = np.isfinite(values)
+        for total, more in zip(sums, (np.where(known, values, 0.0), known.astype(np.float64)), strict=True):
+            total[:] = np.cumsum(np.column_stack([total, more]), axis=1)[:, -1]
+
+    def _mean(self, state: FloatArray) -> SpanFeatures:
+        """Return the features of the span that runs; a covariate without any value is NaN, which nothing is like."""
+        total, number = state[self.model.in_a_row : self._sums][1:].reshape(2, -1)
+        with np.errstate(invalid="ignore"):
+            return self._span(state).mean()._replace(covariates=total / number)
 
     def unfinished(self, state: FloatArray, end: int) -> SpanScore | None:
         """Return the span that runs, as if it ended here, where it has lasted for half a span at least."""
         sums = self._span(state)
         if 2.0 * sums.counts[0] < self.model.layout.span:
             return None
-        span = sums.mean()
-        return SpanScore(end, self.model.score(span) / self.model.limit, self.value(state), span)
+        span = self._mean(state)
+        return SpanScore(end, self.model.ratio(span), self.value(state), span)
 
     def value(self, state: FloatArray) -> float:
         """Return the smallest of the newest scores in a row: above 1, a running monitor raises the alarm."""
         return float(state[: self.model.in_a_row].min())
 
     def _span(self, state: FloatArray) -> SpanSums:
-        return SpanSums(self.model.layout, state[self.model.in_a_row : self.head])
+        return SpanSums(self.model.layout, state[self._sums : self.head], self.model.compares_past)
 
 
 class FeatureValues(NamedTuple):
@@ -110,14 +151,26 @@ class FeatureLanes:
         smallest = np.where(self._others, np.inf, scores).min(axis=1)
         return np.asarray(np.where(self._others.all(axis=1), 0.0, smallest))
 
-    def run(self, rows: FloatArray, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> FeatureValues:
-        """Feed a block of samples, each of shape (assets, N); the rows are changed in place."""
+    def run(
+        self,
+        rows: FloatArray,
+        r: FloatArray,
+        u: FloatArray,
+        y: FloatArray,
+        restart: BoolArray,
+        channels: Mapping[str, FloatArray] = NO_CHANNELS,
+    ) -> FeatureValues:
+        """Feed a block of samples, each of shape (assets, N); the rows are changed in place.
+
+        `channels`: covariates of the one asset, shape (N,) each, where it depends on any.
+        """
         before, spans = self.values(rows), []
-        ended = groupby(self._windows.run(rows, r, u, y, restart), key=itemgetter(0))
-        for asset, windows in ended:
-            one = self._assets[asset]
-            assert one is not None
-            found = one.score(rows[asset, self._column : self._column + one.size], (window for _, window in windows))
+        ended = {asset: [*each] for asset, each in groupby(self._windows.run(rows, r, u, y, restart), itemgetter(0))}
+        for asset, one in enumerate(self._assets):
+            if one is None or not (asset in ended or one.model.covariates):
+                continue
+            windows = (window for _, window in ended.get(asset, ()))
+            found = one.score(rows[asset, self._column : self._column + one.size], windows, channels)
             spans += [(asset, span.end - 1, span.value) for span in found]
         return FeatureValues(before, spans)
 

@@ -28,8 +28,9 @@ SILENCE_SHARE = 1e-6  # of the largest u: what a resampling filter leaves of 0
 JUMP_SHARE = 0.4  # of the range of y, in one sample: a counter that wraps or is reset
 MAX_JUMP_SHARE = 0.1  # share of the samples
 MIN_STEP_RATIO = 2.0  # times smaller are all other steps of y, and those of r at that time
-LEAD_SAMPLES = 3  # samples that r may step before y does
+LEAD_SAMPLES = 3  # samples beyond the delay from u to y that r may step before y does
 MAX_ROWS = 50_000  # that the residual is computed from
+BEGINNING_SHARE = 0.25  # of the rows in motion: what a log has wrong, a unit or a sign, it has wrong there too
 MIN_WRONG_SHARE, MAX_RIGHT_SHARE = (
     0.1,
     0.05,
@@ -71,15 +72,19 @@ class Correction:
         return message("signals.unit" if len(scaled) == 1 else "signals.units", names=scaled, factor=factor)
 
 
-def find_signal_defect(recording: Recording) -> SignalDefect | None:
-    """Return the first place where y or u is stuck while the motion demands a change, or where y jumps."""
+def find_signal_defect(recording: Recording, delay_s: float = 0.0) -> SignalDefect | None:
+    """Return the first place where y or u is stuck while the motion demands a change, or where y jumps.
+
+    `delay_s`: from u to y, by which a step of y that r asks for comes later.
+    """
     span = float(np.ptp(recording.y))
     settings = QualitySettings(frozen_s=FROZEN_S, frozen_travel=TRAVEL_SHARE * span or None)
     limits, state = settings.limits(recording.sample_rate), init_state()
+    lead = LEAD_SAMPLES + round(delay_s * recording.sample_rate)
     for chunk in outofcore.iter_chunks(0, recording.samples):
         rows = recording.rows(chunk)
         state, findings = check_block(limits, state, rows.t, rows.r, rows.u, rows.y)
-        found = [_frozen_defect(recording, finding) for finding in findings] + [_find_jump(rows, chunk.start)]
+        found = [_frozen_defect(recording, finding) for finding in findings] + [_find_jump(rows, chunk.start, lead)]
         outofcore.release(*recording.columns)
         if defects := [defect for defect in found if defect is not None]:
             return min(defects, key=lambda defect: defect.begin)
@@ -141,6 +146,17 @@ def find_corrections(
             yield correction
 
 
+def begins_wrong(pipeline: Pipeline, theta: FloatArray, recording: Recording, correction: Correction) -> bool:
+    """Return whether a correction explains the first motion of a recording better, too; a fault may begin later."""
+    if correction.factors[1:] == (1.0, 1.0) and correction.order == (0, 1, 2):
+        return True  # r in another unit, which the plant does not notice
+    rows = recording.rows(slice(0, MAX_ROWS))
+    found = correction.apply(rows)
+    before, _ = _residual_share(pipeline, theta, rows, BEGINNING_SHARE)
+    after, _ = _residual_share(pipeline, theta, found, BEGINNING_SHARE)
+    return after * HEALTHY_RESIDUAL_RATIO < before
+
+
 def describe_misfit(pipeline: Pipeline, theta: FloatArray, recording: Recording) -> Message | None:
     """Return what is wrong with signals that the plant with theta explains only when they are put right.
 
@@ -180,13 +196,19 @@ def _reference_corrections(rows: Recording) -> Iterator[Correction]:
                 yield Correction(factors=(factor, 1.0, 1.0))
 
 
-def _residual_share(pipeline: Pipeline, theta: FloatArray, rows: Recording) -> tuple[float, float]:
-    """Return the mean square of what the plant with theta leaves of eta: relative, and in units of eta."""
+def _residual_share(
+    pipeline: Pipeline, theta: FloatArray, rows: Recording, beginning: float = 1.0
+) -> tuple[float, float]:
+    """Return the mean square of what the plant with theta leaves of eta: relative, and in units of eta.
+
+    `beginning`: share of the rows in motion that is looked at.
+    """
     g = pipeline.regression(rows.r, rows.u, rows.y, rows.restart)
     if not g.ok.any():
         return np.inf, np.inf
-    left = float(np.mean((g.eta[g.ok] - g.phi[g.ok] @ theta) ** 2))
-    whole = float(np.mean(g.eta[g.ok] ** 2))
+    used = np.flatnonzero(g.ok)[: int(np.ceil(beginning * g.ok.sum()))]
+    left = float(np.mean((g.eta[used] - g.phi[used] @ theta) ** 2))
+    whole = float(np.mean(g.eta[used] ** 2))
     return (left / whole if whole > 0.0 else np.inf), left
 
 
@@ -207,24 +229,39 @@ def _frozen_defect(recording: Recording, finding: QualityFinding) -> SignalDefec
         begin -= 1
     if name == "u" and not x.min() < x[at] < x.max():
         return None  # it is limited
+    if name == "y" and _follows_late(recording, begin):
+        return None
     other = "r" if name == "y" else "r - y"
     text = message("signals.frozen", name=name, t=float(recording.t[begin]), other=other, by=finding.value)
     return SignalDefect(begin, text)
 
 
-def _largest_near(steps: FloatArray, at: npt.NDArray[np.intp]) -> float:
-    near = np.clip(at[:, None] + np.arange(-LEAD_SAMPLES, 2), 0, len(steps) - 1)
+def _follows_late(recording: Recording, begin: int) -> bool:
+    """Return whether y, at rest from a sample on, moves within `FROZEN_S` of the motion of r that should move it.
+
+    A rest before the command says nothing of the sensor, and a loop may take a while to break away.
+    """
+    travel = TRAVEL_SHARE * float(np.ptp(recording.y))
+    moved = np.flatnonzero(recording.y[begin:] != recording.y[begin])
+    end = begin + int(moved[0]) if len(moved) else recording.samples
+    r = recording.r[begin:end]
+    demanded = np.maximum.accumulate(r) - np.minimum.accumulate(r) > travel
+    return bool(demanded.any()) and len(r) - int(np.argmax(demanded)) <= FROZEN_S * recording.sample_rate
+
+
+def _largest_near(steps: FloatArray, at: npt.NDArray[np.intp], lead: int) -> float:
+    near = np.clip(at[:, None] + np.arange(-lead, 2), 0, len(steps) - 1)
     return float(steps[near].max())
 
 
-def _find_jump(rows: Recording, first: int) -> SignalDefect | None:
+def _find_jump(rows: Recording, first: int, lead: int) -> SignalDefect | None:
     steps = np.where(rows.restart[1:], 0.0, np.abs(np.diff(rows.y)))
     span = float(np.ptp(rows.y))
     jumps = np.flatnonzero(steps > JUMP_SHARE * span) if span > 0.0 else np.zeros(0, dtype=np.intp)
     if not len(jumps) or len(jumps) > MAX_JUMP_SHARE * len(steps):
         return None
     size, other = float(np.median(steps[jumps])), float(np.delete(steps, jumps).max(initial=0.0))
-    demanded = _largest_near(np.abs(np.diff(rows.r)), jumps)
+    demanded = _largest_near(np.abs(np.diff(rows.r)), jumps, lead)
     if MIN_STEP_RATIO * max(other, demanded) > size or np.ptp(steps[jumps]) > 2.0 * other:
         return None  # a motion, or jumps of several sizes
     begin = int(jumps[0]) + 1

@@ -10,6 +10,7 @@ import numpy as np
 from servoscope.baseline.expectation import Expectation
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import SimulationError
 from servoscope.detection.onset import Onset
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.examine import Examination
@@ -177,8 +178,13 @@ def fit_actuator(
     def misfit(x: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.solve(L, (theta - expected(x)) / size))
 
+    begin = np.log([guess.get(name, 1.0) for name in names])
+    try:
+        expected(begin)
+    except SimulationError:  # a size far from healthy may make the loop unstable
+        begin = np.zeros(len(names))
     experiment = Experiment(misfit, np.full(len(names), PRIOR_LOG_STD), difference=STEP)
-    x = fit(experiment, np.log([guess.get(name, 1.0) for name in names]), steps=MAX_STEPS, tolerance=EXACT).x
+    x = fit(experiment, begin, steps=MAX_STEPS, tolerance=EXACT).x
     here = expected(x)
     J, T = np.empty((len(theta), len(names))), np.empty((len(theta), len(names)))
     loop = expectation.pipeline.loop

@@ -15,9 +15,14 @@ def what_to_check(loop: Loop, interval: FaultInterval | None) -> tuple[Message, 
     """Return what to check for the faults of an interval, the likeliest first; nothing without an interval."""
     if interval is None:
         return ()
-    likely = [one for one in interval.candidates if one.probability >= MIN_PROBABILITY_CHECKED]
-    names = [one.name for one in interval.faults] or [name for one in likely for name in one.names]
-    return tuple(found for name in dict.fromkeys(names) for found in checks_of_fault(loop, name))
+    return tuple(check for name in suspects(interval) for check in checks_of_fault(loop, name))
+
+
+def suspects(interval: FaultInterval) -> tuple[str, ...]:
+    """Return the names of the faults to look for: those that are named, else those that are likely."""
+    likely = [candidate for candidate in interval.candidates if candidate.probability >= MIN_PROBABILITY_CHECKED]
+    names = [fault.name for fault in interval.faults] or [name for candidate in likely for name in candidate.names]
+    return tuple(dict.fromkeys(names))
 
 
 def checks_of_fault(loop: Loop, name: str) -> Iterator[Message]:

@@ -33,6 +33,7 @@ from servoscope.diagnosis.result import (
     FinalCoefficient,
     ResponsePoint,
     Verdict,
+    keep_inputs,
     recording_facts,
 )
 from servoscope.diagnosis.sensor_check import check_sensors
@@ -59,8 +60,7 @@ if TYPE_CHECKING:
 
 MIN_CERTAINTY = 0.95  # probability from which a fault is named
 MAX_SIGNAL = 1e60  # of a signal; products of four of them still are numbers
-# probability of an unknown change from which an operating point does not explain a recording
-MIN_UNKNOWN_PROBABILITY = 0.05
+MIN_UNKNOWN_PROBABILITY = 0.05  # of an unknown change, from which an operating point does not explain a recording
 
 
 @with_one_blas_thread
@@ -102,8 +102,8 @@ def diagnose(
     [('lubrication', 1.25)]
     """
     learned = Baseline.of(baseline)
-    judged = as_recording(recording, learned.loop)
-    return _diagnose_at_point(learned, judged, progress, point)[0].made_of(learned, judged)
+    diagnosis = _diagnose_at_point(learned, as_recording(recording, learned.loop), progress, point)[0]
+    return keep_inputs(diagnosis, baseline if point is None else learned.at(point), recording)
 
 
 @with_one_blas_thread
@@ -139,7 +139,7 @@ def _judge_sound_part(
     baseline: Baseline, recording: Recording, progress: Callable[[str], None], point: str | None
 ) -> tuple[Diagnosis, Examination, BiasCorrection | None]:
     """Return what `_diagnose_at_point` does, of the recording up to a signal that is stuck or jumps."""
-    defect = find_signal_defect(recording)
+    defect = find_signal_defect(recording, baseline.loop.delay)
     if defect is not None:
         sound = recording.part(float(recording.t[0]), float(recording.t[max(defect.begin, MIN_SAMPLES)]))
         diagnosis, exam, correction = _judge_signals(baseline, sound, progress, point)

@@ -90,8 +90,11 @@ class Examination:
             else:
                 along = follow_warm_up(pipeline, model, theta, recording, memory)
             place = ", ".join(filter(None, [baseline.point, along.place]))
+            # features are compared at the covariates of each span, and an axis at those of each sample
+            axis = {"axis": baseline.axis} if baseline.axis is not None and baseline.axis.moves is not None else {}
+            followed: dict[str, Any] = {"point": place, "features": baseline.features, **axis}
             baseline = baseline.at(dict(zip(model.names, along.averages[-1].tolist(), strict=True)))
-            baseline = baseline.model_copy(update={"point": place})
+            baseline = baseline.model_copy(update=followed)
         exam = _run_quickly(baseline, recording) if quick and along is None else None
         exam = exam or _run_recursion(baseline, recording, pipeline, along)
         skipped = _skipped_share(exam.estimates)
@@ -112,8 +115,9 @@ class Examination:
 
     @cached_property
     def drifts(self) -> bool:
-        """Whether covariates move the healthy coefficients within the recording by as much as their uncertainty."""
-        if self.along is None or not self.evaluations:
+        """Whether covariates move the healthy coefficients by as much as their uncertainty, and no refit follows."""
+        axis = self.baseline.axis
+        if self.along is None or not self.evaluations or (axis is not None and axis.moves is not None):
             return False
         theta = self.along.expected(self.estimates.index)
         C = np.broadcast_to(self.covariance(self.evaluations - 1), self.estimates.S.shape)

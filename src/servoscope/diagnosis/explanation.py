@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from servoscope.core.errors import LoopError
 from servoscope.core.messages import Message, message
 from servoscope.core.number_format import ratio_digits
 from servoscope.detection.trace import Trace
+from servoscope.diagnosis.change_words import change_messages, fault_label
 from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.result import VIBRATION, DiagnosisWarning, FaultInterval, RefitSummary, Verdict
 from servoscope.estimation.filter_bank import nominal_theta
@@ -59,12 +60,12 @@ def build_headline(
     mimic = interval.refit.mimics[0].description if interval.refit and interval.refit.mimics else None
     if interval.faults:
         alike = message("diagnosis.mimic_alike", cause=mimic) if mimic else None
-        names, first = tuple(fault.name for fault in interval.faults), interval.faults[0]
+        first = interval.faults[0]
         if first.learned:
-            values = _size_values(first)
-            return message("diagnosis.fault_learned", point=at, names=names, since=since, mimic=alike, **values)
-        estimates = _size_messages(interval.faults)
-        return message("diagnosis.fault", point=at, names=names, sizes=estimates, since=since, mimic=alike)
+            values = {"names": _labels(fault.name for fault in interval.faults), **_size_values(first)}
+            return message("diagnosis.fault_learned", point=at, since=since, mimic=alike, **values)
+        changes = change_messages(interval.faults)
+        return message("diagnosis.fault", point=at, changes=changes, since=since, mimic=alike)
     likely = [c for c in interval.candidates if c.probability >= MIN_LISTED_PROBABILITY]
     if likely[0].name == UNKNOWN and (likely[0].probability >= 0.5 or len(likely) == 1):
         instead = message("diagnosis.mimic_instead", cause=mimic) if mimic else None
@@ -103,12 +104,16 @@ def _stretch_message(interval: FaultInterval) -> Message:
         when = message("diagnosis.stretch_when", from_s=begin, to_s=interval.end_s)
     if not interval.faults:
         best = interval.candidates[0]
-        return message("diagnosis.stretch_open", names=best.names, probability=best.probability, when=when)
-    names = tuple(fault.name for fault in interval.faults)
+        return message("diagnosis.stretch_open", names=_labels(best.names), probability=best.probability, when=when)
+    names = _labels(fault.name for fault in interval.faults)
     sizes = tuple(
         message("diagnosis.stretch_size", parameter=fault.parameter, **_size_values(fault)) for fault in interval.faults
     )
     return message("diagnosis.stretch", names=names, sizes=sizes, when=when)
+
+
+def _labels(names: Iterable[str]) -> tuple[str, ...]:
+    return tuple(map(fault_label, names))
 
 
 def _onset_message(interval: FaultInterval) -> Message | None:
@@ -125,7 +130,7 @@ def _ambiguous_headline(likely: Sequence[Candidate], at: Message | None, since: 
     """Say which explanations remain, and which parameters they confuse."""
     known = [c for c in likely if c.name != UNKNOWN]
     rest = [message("diagnosis.candidate_unknown", probability=c.probability) for c in likely if c.name == UNKNOWN]
-    listed = [message("diagnosis.candidate", names=c.names, probability=c.probability) for c in known]
+    listed = [message("diagnosis.candidate", names=_labels(c.names), probability=c.probability) for c in known]
     if len(known) == 1 and rest:
         return message("diagnosis.fault_or_unknown", point=at, since=since, candidate=listed[0], unknown=rest[0])
     if len(known) == 1:
@@ -146,8 +151,6 @@ def _size_values(fault: FaultEstimate) -> dict[str, float | str]:
 
 def _size_messages(faults: Sequence[FaultEstimate]) -> tuple[Message, ...]:
     first, *others = faults
-    if not others and first.parameter == first.name:
-        return (message("diagnosis.size_of_it", **_size_values(first)),)
     if first.mass_kg is not None:
         mass, low, high = first.mass_kg
         size = message(
@@ -169,6 +172,7 @@ def _size_messages(faults: Sequence[FaultEstimate]) -> tuple[Message, ...]:
 def build_reasons(exam: Examination, trace: Trace, interval: FaultInterval) -> tuple[Message, ...]:
     """Return the explanation of an alarm; `trace`: the evaluation that is explained, without bias."""
     reasons = (
+        _size_reason(interval),
         _alarm_reason(exam, interval),
         _coefficients_reason(exam, trace),
         _response_reason(exam, trace),
@@ -178,6 +182,12 @@ def build_reasons(exam: Examination, trace: Trace, interval: FaultInterval) -> t
         _mimics_reason(interval.candidates, interval.refit),
     )
     return tuple(reason for reason in reasons if reason is not None)
+
+
+def _size_reason(interval: FaultInterval) -> Message | None:
+    if not interval.faults or interval.faults[0].learned:
+        return None
+    return message("diagnosis.sizes", sizes=_size_messages(interval.faults))
 
 
 def _alarm_reason(exam: Examination, interval: FaultInterval) -> Message | None:
@@ -255,7 +265,7 @@ def _fit_reason(candidates: Sequence[Candidate], refit: RefitSummary | None) -> 
     values = {"from_s": refit.from_s, "to_s": refit.to_s, "misfit": refit.misfit, "limit": refit.limit}
     if refit.misfit > refit.limit:
         return message("diagnosis.unexplained", **values)
-    return message("diagnosis.explained", names=best.names, **values)
+    return message("diagnosis.explained", names=_labels(best.names), **values)
 
 
 def _rejection_reason(exam: Examination, trace: Trace, candidates: Sequence[Candidate]) -> Message | None:
@@ -275,7 +285,7 @@ def _rejection(exam: Examination, trace: Trace, other: Candidate, first: bool) -
         size = message("diagnosis.rejected_size_learned", ratio=fault.ratio)
     else:
         size = message("diagnosis.rejected_size_parameter", parameter=fault.parameter, ratio=fault.ratio)
-    values = {"name": other.name, "size": size}
+    values = {"name": fault_label(other.name), "size": size}
     if other.misfit:
         values["distance"] = _distance_message(float(np.sqrt(other.misfit)), first)
     coefficient, sign = _worst_coefficient(exam, trace, other)
@@ -313,7 +323,7 @@ def _second_fault_reason(candidates: Sequence[Candidate]) -> Message | None:
     if not pairs or best.name == UNKNOWN or max(c.probability for c in pairs) >= MIN_LISTED_PROBABILITY:
         return None
     others = sorted({name for pair in pairs for name in pair.names} - set(best.names))
-    return message("diagnosis.second_fault", names=tuple(others))
+    return message("diagnosis.second_fault", names=_labels(others))
 
 
 def _mimics_reason(candidates: Sequence[Candidate], refit: RefitSummary | None) -> Message | None:

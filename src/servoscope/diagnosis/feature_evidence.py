@@ -8,7 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from servoscope.baseline.feature_model import FeatureModel, FeatureName, SpanFeatures
+from servoscope.baseline.feature_model import FeatureModel, FeatureName
+from servoscope.baseline.feature_spans import SpanFeatures
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray, IntArray
 from servoscope.core.messages import Message, message
@@ -38,7 +39,7 @@ class FeatureEvidence:
         state = monitor.start()
         for rows in outofcore.iter_chunks(0, recording.samples):
             part = recording.rows(rows)
-            spans += monitor.run(state, part.r, part.u, part.y, part.restart)
+            spans += monitor.run(state, part.r, part.u, part.y, part.restart, part.channels)
         if (last := monitor.unfinished(state, recording.samples)) is not None:
             spans.append(last)
         known = tuple(span for span in spans if np.isfinite(span.ratio))
@@ -88,13 +89,15 @@ class FeatureEvidence:
 
     def _changes(self, span: SpanScore) -> tuple[Message, ...]:
         """Say which features differ, the most changed first: of which signal, in which motion and band."""
-        scores = self.model.scores(span.features)
-        one = self.model.statistics[int(np.argmax(scores))]
-        values = span.features.values[one.level]
-        off = np.nan_to_num(one.deviations(values))
+        one = self.model.statistics[int(np.argmax(self.model.ratios(span.features)))]
+        (values, _), covariates = one.group.pick(span.features), span.features.covariates
+        off, healthy = np.nan_to_num(one.deviations(values, covariates)), one.expected(covariates)
+        if one.group.past:  # described by the later windows against the earlier ones
+            later = span.features.values[one.group.level, list(one.group.kept)]
+            values, healthy = later, later - values + healthy
         most = np.argsort(-np.abs(off))[:MAX_FEATURES_NAMED].tolist()
         return tuple(
-            _describe(FeatureName.of(self.model.layout, int(one.kept[k])), float(values[one.kept[k]]), one.centre[k])
+            _describe(FeatureName.of(self.model.layout, one.group.kept[k]), float(values[k]), float(healthy[k]))
             for k in most
             if abs(off[k]) >= MIN_STD or k == most[0]
         )
@@ -103,12 +106,23 @@ class FeatureEvidence:
 def mean_of(spans: Sequence[SpanFeatures]) -> SpanFeatures:
     """Return the mean of spans, each weighted by its windows."""
     counts = np.array([span.counts for span in spans])
-    values = np.array([span.values for span in spans])
+    shifts = np.array([span.shift_counts for span in spans])
+    return SpanFeatures(
+        _weighted_mean([span.values for span in spans], counts),
+        counts.sum(axis=0),
+        spans[-1].motion,
+        _weighted_mean([span.shift for span in spans], shifts),
+        shifts.sum(axis=0),
+        np.mean([span.covariates for span in spans], axis=0),
+    )
+
+
+def _weighted_mean(each: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
+    values = np.array(each)
     seen = np.isfinite(values)
-    weights = np.where(seen, counts[:, :, None], 0.0)
+    weight = np.where(seen, weights[:, :, None], 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        mean = (weights * np.where(seen, values, 0.0)).sum(axis=0) / weights.sum(axis=0)
-    return SpanFeatures(mean, counts.sum(axis=0), spans[-1].motion)
+        return np.asarray((weight * np.where(seen, values, 0.0)).sum(axis=0) / weight.sum(axis=0))
 
 
 def _describe(name: FeatureName, value: float, healthy: float) -> Message:

@@ -22,8 +22,6 @@ from servoscope.estimation.frequency_response import FrequencyResponse
 if TYPE_CHECKING:
     from servoscope.estimation.recursion import Recursion
 
-JUDGED_COLUMNS = "statistic", "theta", "expected", "covariance"
-
 
 class Monitor:
     """Follows one asset, or a fleet of assets, block by block or sample by sample.
@@ -372,8 +370,6 @@ class Monitor:
         threshold: Any = self._limits
         if not self.fleet:
             columns = {name: values[0] for name, values in columns.items()}
-            if motion is not None:
-                columns["statistic"] = motion.soften_statistic(**{name: columns[name] for name in JUDGED_COLUMNS})
             response, threshold = (response[0][0], response[1][0]), self.baselines[0].thresholds.statistic
         expected = FrequencyResponse(f, columns.pop("H"), columns.pop("covariance of H"))
         trace = Trace(

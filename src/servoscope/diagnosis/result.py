@@ -2,33 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 from pydantic import computed_field, model_validator
 
-from servoscope.core.errors import OutputError, RecordingError
+from servoscope.core.above import function_above
+from servoscope.core.errors import OutputError
 from servoscope.core.messages import (
     Message,
     MessageField,
     MessageText,
     clock_of,
-    format_moment,
     message,
     read_messages,
     render,
     text_message,
-    translate,
 )
-from servoscope.core.public import picture_html, public_name
 from servoscope.core.short_repr import ShortRepr
-from servoscope.diagnosis.dates import date_headline
+from servoscope.diagnosis.dates import date_timeline
 from servoscope.isolation.candidate import Candidate, FaultEstimate, ResultModel
 from servoscope.signals import Defect, Recording
+from servoscope.signals.recording import frame_of
 
 Verdict = Literal["healthy", "fault", "undetermined"]
-MAX_LINES = 10  # that `print` shows
+MAX_ALIKE = 3  # defects of one kind that are shown one by one
+DEFECT_KINDS = ("gap", "nan", "repeat", "spike", "order", "text", "saturation")
 VIBRATION = "vibration"  # a fault that moves no parameter: what is left of the motion is louder
 
 
@@ -130,6 +132,21 @@ class DiagnosisWarning(ResultModel):
         )
 
 
+def sum_up(warnings: Sequence[DiagnosisWarning]) -> list[DiagnosisWarning]:
+    """Return warnings, defects of a kind that came more than MAX_ALIKE times as one."""
+    kinds = Counter(warning.kind for warning in warnings if warning.kind in DEFECT_KINDS)
+    summed: dict[str, DiagnosisWarning] = {}
+    for number, warning in enumerate(warnings):
+        if kinds[warning.kind] <= MAX_ALIKE:
+            summed[str(number)] = warning
+        elif warning.kind not in summed:
+            alike = [each for each in warnings if each.kind == warning.kind]
+            text = message("diagnosis.alike", first=warning.description, times=len(alike))
+            count, to_s = sum(each.count for each in alike), max(each.to_s for each in alike)
+            summed[warning.kind] = warning.model_copy(update={"description": text, "count": count, "to_s": to_s})
+    return list(summed.values())
+
+
 class FaultInterval(ResultModel):
     """A time during which the actuator differed from healthy, and what explains that."""
 
@@ -197,6 +214,12 @@ class Diagnosis(ShortRepr, ResultModel):
     began, zone
         When the recording began [s since 1970], and UTC, or nothing where its dates are as they are written; None
         where it has no dates.
+
+    Examples
+    --------
+    >>> diagnosis = ss.diagnose("baseline.json", "friday.csv")
+    >>> [(fault.name, round(fault.ratio, 2), round(diagnosis.onset_s[1])) for fault in diagnosis.faults]
+    [('lubrication', 1.25, 40)]
     """
 
     recording: str
@@ -233,12 +256,7 @@ class Diagnosis(ShortRepr, ResultModel):
         return self.intervals[-1] if self.intervals else FaultInterval()
 
     def _shown_facts(self) -> dict[str, object]:
-        facts: dict[str, object] = {"recording": self.recording, "verdict": self.verdict, "summary": self.summary}
-        sizes = [
-            f"{fault.name} {fault.ratio:.4g} ({fault.interval[0]:.4g} to {fault.interval[1]:.4g})"
-            for fault in self.faults
-        ]
-        return {**facts, **({"size": "; ".join(sizes)} if sizes else {})}
+        return {"recording": self.recording, "verdict": self.verdict, "summary": self.summary}
 
     @computed_field  # type: ignore[prop-decorator]
     @property
@@ -289,51 +307,13 @@ class Diagnosis(ShortRepr, ResultModel):
         """What the candidates rest on; None where the recursion alone found them."""
         return self.current.refit
 
-    def dated_headline(self, began: float, onset: float | None = None) -> Message:
-        """Return the headline with a date instead of seconds since the recording began, at `began` [UTC s].
-
-        `onset`: of a change that is older than the recording, where it is known [UTC s].
-        """
-        interval = self.current
-        begin = None if interval.onset_s is None else interval.onset_s[1]
-        return date_headline(self.headline, began, begin, onset, from_start=interval.from_start)
-
-    def _shown_lines(self) -> list[str]:
-        """Return what `print` shows: at most ten lines."""
-        dates = "" if self.began is None else f", {render(message('cli.dates', zone=self.zone or 'local'))}"
-        lines = [
-            f"{self.recording}: {self.duration_s:.6g} s, {self.samples} {translate('samples')}{dates}",
-            self.summary,
-        ]
-        facts = [("what to check", str(check)) for check in self.checks[:2]]
-        with clock_of(self.began):
-            if self.onset_s is not None:
-                low, likely, high = self.onset_s
-                facts.append(("onset", f"{format_moment(likely)} ({low:.4g} to {high:.4g} s, 95 %)"))
-            if self.detected_at_s is not None:
-                facts.append(("detected", format_moment(self.detected_at_s)))
-        if self.faults and self.probability is not None:
-            facts.append(
-                (
-                    "how sure",
-                    render(
-                        message("diagnosis.candidate", names=[self.candidates[0].name], probability=self.probability)
-                    ),
-                )
-            )
-        facts += [("why", reason) for reason in self.explanation[:1]]
-        lines += [f"  {translate(name)}: {text}" for name, text in facts]
-        if self.warnings:
-            lines.append(f"  {translate('warnings')}: {len(self.warnings)}")
-        return lines[:MAX_LINES]
-
     def __str__(self) -> str:
-        return "\n".join(self._shown_lines())
+        """Return what `diagnose` prints first: the verdict, what to check, since when, how large, how sure."""
+        return str(function_above("cli.render.diagnosis", "diagnosis_text")(self))
 
-    def made_of(self, baseline: object, recording: Recording) -> Self:
-        """Keep what its report shows; no field: it is neither written nor compared."""
-        vars(self)["_made_of"] = baseline, recording
-        return self
+    def _repr_html_(self) -> str:
+        """Return the same as a table for notebooks, with a picture."""
+        return str(function_above("report.diagnosis_page", "render_diagnosis_cell")(self))
 
     def plot(self, backend: Literal["matplotlib", "plotly"] = "matplotlib") -> Any:
         """Draw the coefficients over their healthy values, as `servoscope.plot` does.
@@ -344,23 +324,23 @@ class Diagnosis(ShortRepr, ResultModel):
         >>> axes.get_title()
         'friday.csv: fault'
         """
-        return public_name("plot")(self, backend)
+        return function_above("report.plots", "plot")(self, backend)
 
     def report(self, path: str | Path) -> None:
         """Write the report on it as one HTML page, as `servoscope.write_report` does.
 
-        Raises OutputError if the page cannot be written, or the diagnosis was read from a file.
+        Raises OutputError if the page cannot be written, or the diagnosis does not come from `diagnose`.
 
         Examples
         --------
         >>> ss.diagnose("baseline.json", "friday.csv").report("friday.html")
         """
-        made_of = vars(self).get("_made_of")
+        made_of = vars(self).get("made_of")
         if made_of is None:
             raise OutputError(
-                f"{path}: this diagnosis has no recording with it, use write_report(path, baseline, recording)"
+                f"{path}: only what diagnose returned has a report, write_report(path, baseline, recording)"
             )
-        public_name("write_report")(path, *made_of)
+        function_above("report.diagnosis_page", "write_report")(path, *made_of)
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `diagnose --json` prints, as a dictionary.
@@ -368,32 +348,48 @@ class Diagnosis(ShortRepr, ResultModel):
         Examples
         --------
         >>> ss.diagnose("baseline.json", "friday.csv").to_dict()["faults"][0]["name"]
-        'viscous_friction'
+        'lubrication'
         """
-        return self.model_dump(mode="json")
+        return dict(json.loads(self.model_dump_json()))
 
     def to_frame(self) -> Any:
-        """Return a frame of pandas: one row per fault of each interval, with its size, onset and probability.
+        """Return the faults as a frame of pandas, a row for each fault of an interval: size, onset, probability.
 
-        Raises RecordingError if pandas is not installed.
+        Raises RecordingError if pandas is missing.
 
         Examples
         --------
-        >>> list(ss.diagnose("baseline.json", "friday.csv").to_frame()["fault"])
-        ['viscous_friction']
+        >>> ss.diagnose("baseline.json", "friday.csv").to_frame()["fault"].tolist()
+        ['lubrication']
         """
-        try:
-            import pandas as pd
-        except ModuleNotFoundError:
-            raise RecordingError(f"{self.recording}: a frame needs pandas, pip install pandas") from None
-        return pd.DataFrame([self._row(interval, fault) for interval in self.intervals for fault in interval.faults])
+        rows = []
+        for interval in self.intervals:
+            low, onset, high = interval.onset_s or (None, None, None)
+            when = {"onset_s": onset, "onset_low_s": low, "onset_high_s": high, "end_s": interval.end_s}
+            for fault in interval.faults:
+                size = {"ratio": fault.ratio, "ratio_low": fault.interval[0], "ratio_high": fault.interval[1]}
+                rows.append({"fault": fault.name, **size, **when, "probability": interval.probability})
+        return frame_of(self.recording, [{"recording": self.recording, "verdict": self.verdict, **row} for row in rows])
 
-    def _row(self, interval: FaultInterval, fault: FaultEstimate) -> dict[str, Any]:
-        low, onset, high = interval.onset_s or (None, None, None)
-        row = {"recording": self.recording, "verdict": self.verdict, "fault": fault.name, "ratio": fault.ratio}
-        row |= {"ratio_low": fault.interval[0], "ratio_high": fault.interval[1], "probability": interval.probability}
-        return {**row, "onset_s": onset, "onset_low_s": low, "onset_high_s": high, "end_s": interval.end_s}
+    def dated_headline(self, began: float, onset: float | None = None) -> Message:
+        """Return the headline with a date instead of seconds since the recording began, at `began` [UTC s].
 
-    def _repr_html_(self) -> str:
-        """Return a table for notebooks, with what to check and a picture."""
-        return super()._repr_html_() + (picture_html(self) if self.parameters else "")
+        `onset`: of a change that is older than the recording, where it is known [UTC s].
+        """
+        if self.headline.key == "diagnosis.timeline":
+            return date_timeline(self.headline, began)
+        since = self.headline.values.get("since")
+        if self.current.onset_s is None or not isinstance(since, Message):
+            return self.headline
+        if self.current.from_start and onset is None:
+            since = message("diagnosis.since_start_date", t=began)
+        else:
+            at = began + self.current.onset_s[1] if onset is None else onset
+            since = message("diagnosis.since_date", t=at, growth=since.values.get("growth"))
+        return self.headline.model_copy(update={"values": {**self.headline.values, "since": since}})
+
+
+def keep_inputs(diagnosis: Diagnosis, *inputs: object) -> Diagnosis:
+    """Keep baseline and recording for the report on a diagnosis: no fields, so neither written nor compared."""
+    vars(diagnosis)["made_of"] = inputs
+    return diagnosis

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ import numpy.typing as npt
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import BaselineError
-from servoscope.detection.covariate_monitor import CovariateHistory, CovariateMonitor
+from servoscope.detection.covariate_monitor import CovariateHistory, CovariateMonitor, read_channels
 from servoscope.detection.feature_monitor import FeatureLanes, FeatureMonitor, FeatureValues
 from servoscope.detection.motion_monitor import MotionEvidence, MotionMonitor
 from servoscope.detection.trace import Trace
@@ -34,7 +35,7 @@ class SideMonitors:
 
     def __init__(self, baseline: Baseline, pipeline: Pipeline) -> None:
         self._baseline, self._pipeline = baseline, pipeline
-        model, covariates = baseline.features, baseline.covariates
+        model, covariates, self.logged = baseline.features, baseline.covariates, baseline.logged_covariates
         self.features = None if model is None else FeatureMonitor(model)
         self.covariates: CovariateMonitor | None = None
         if covariates is not None and covariates.warm_up is not None:
@@ -56,8 +57,6 @@ class SideMonitors:
     def check_motion(self) -> None:
         """Let a motion never seen make an alarm harder."""
         one = self._baseline
-        if one.covariates is not None:
-            raise BaselineError("the motion is not checked where there are covariates: leave motion_check out")
         if one.motion is None and not one.extrapolates:
             raise BaselineError("this baseline does not hold the motion of its recordings: learn it again")
         if one.limited_motion is not None:
@@ -106,10 +105,13 @@ class SideMonitors:
         return {} if self.covariates is None else self.covariates.history(self._split(state)[1])
 
     def compare(self, trace: Trace, values: SideValues, index: npt.NDArray[np.int64]) -> Trace:
-        """Return the evaluations at some samples of a block, compared with what is healthy at the covariates there."""
-        if self.covariates is None or values.averages is None:
+        """Return the evaluations at some samples of a block, compared with what is healthy there."""
+        if self.covariates is not None and values.averages is not None:
+            trace = self.covariates.compare(trace, values.averages[index])
+        if values.motion is None:
             return trace
-        return self.covariates.compare(trace, values.averages[index])
+        softer = values.motion.soften_statistic(trace.statistic, trace.theta, trace.expected, trace.covariance)
+        return replace(trace, statistic=softer if self.covariates is None else np.where(trace.ready, softer, 0.0))
 
 
 class SideLanes:
@@ -150,7 +152,9 @@ class SideLanes:
             return SideValues(None)
         r, u, y = (np.asarray(signal, dtype=np.float64) for signal in signals)
         if self._features is not None:
-            features = self._features.run(rows, r, u, y, restart)
+            if len(self._lanes) == 1:
+                channels = read_channels(self.first.logged, channels, r[0].shape)
+            features = self._features.run(rows, r, u, y, restart, channels)
         if len(self._lanes) > 1:
             return SideValues(features)
         return self.first.run(self._own(rows), (r[0], u[0], y[0]), restart[0], channels, features)

@@ -8,7 +8,7 @@ import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.messages import Message
-from servoscope.detection.signal_defects import SignalDefect, find_corrections
+from servoscope.detection.signal_defects import SignalDefect, begins_wrong, find_corrections
 from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.explanation import undetermined_headline
 from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, recording_facts
@@ -18,8 +18,10 @@ from servoscope.signals import Recording
 
 def describe_correction(points: Sequence[Baseline], recording: Recording) -> Message | None:
     """Return what makes a recording healthy when its signals are put right; None where nothing does."""
-    first = points[0]
-    for correction in find_corrections(first.pipeline(), np.array(first.theta), first.recursion.R, recording):
+    first, theta = points[0], np.array(points[0].theta)
+    for correction in find_corrections(first.pipeline(), theta, first.recursion.R, recording):
+        if not begins_wrong(first.pipeline(), theta, recording, correction):
+            continue
         corrected = correction.apply(recording)
         if any(not Examination.from_recording(point, corrected).apparent_alarm.any() for point in points):
             return correction.description

@@ -154,10 +154,18 @@ class AxisSignals:
     restart: BoolArray
     sample_rate: float
     derivative: int = 0  # 1 where y is a speed
+    factors: FloatArray | None = None  # what multiplies `columns`, of the same shape; None: nothing moves them
 
     @classmethod
     def thinned(
-        cls, u: FloatArray, y: FloatArray, restart: BoolArray, sample_rate: float, stride: int, derivative: int = 0
+        cls,
+        u: FloatArray,
+        y: FloatArray,
+        restart: BoolArray,
+        sample_rate: float,
+        stride: int,
+        derivative: int = 0,
+        factors: FloatArray | None = None,
     ) -> AxisSignals:
         """Take every `stride`-th sample; runs that are shorter are joined to what follows."""
         N = len(y) // stride
@@ -165,7 +173,8 @@ class AxisSignals:
         new: BoolArray = np.any(restart[blocks].reshape(N, stride), axis=1)
         new[0] = True
         acting = u[blocks].reshape(N, stride).mean(axis=1)
-        return cls(acting, y[blocks][::stride], new, sample_rate / stride, derivative)
+        thin = None if factors is None else factors[:, blocks][:, ::stride]
+        return cls(acting, y[blocks][::stride], new, sample_rate / stride, derivative, thin)
 
     @cached_property
     def runs(self) -> tuple[slice, ...]:
@@ -199,7 +208,13 @@ class AxisSignals:
         terms = plant.regressors(self.y, v)
         following = np.append(np.arange(1, len(v)), len(v) - 1)
         following[np.flatnonzero(self.restart[following])] -= 1  # a run ends with its own value
-        return np.array([self.u, *-0.5 * (terms + terms[:, following])])
+        columns = np.array([self.u, *-0.5 * (terms + terms[:, following])])
+        return columns if self.factors is None else columns * self.factors
+
+    @property
+    def force(self) -> FloatArray:
+        """The first of `columns`, shape (N,)."""
+        return self.u if self.factors is None else np.asarray(self.u * self.factors[0])
 
     def moving(self, rest_speed: float, settling: int) -> BoolArray:
         """Return where the axis moves and the filter has forgotten the last rest, reversal and gap, shape (N,).

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servoscope.baseline.axis_model import AxisModel
+from servoscope.baseline.axis_model import AxisModel, AxisMoves
 from servoscope.baseline.feature_model import score_limit
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError
@@ -135,18 +135,18 @@ def fit_axis_noise(problems: Sequence[AxisRegression], slow: float) -> AxisNoise
 
 
 def _fit_drive_and_noise(
-    loop: Loop, recordings: Sequence[Recording], stride: int, slow: float
+    loop: Loop, recordings: Sequence[Recording], stride: int, slow: float, moves: AxisMoves | None
 ) -> tuple[DriveLag, AxisNoise, list[AxisRegression]]:
     """Return how late the force is, the noise, and the regressions with both; a lag that explains little is none."""
     plant, drive = loop.plant, NO_LAG
     assert isinstance(plant, AxisPlant)
 
     def regressions(drive: DriveLag) -> list[AxisRegression]:
-        return [AxisRegression.of(plant, axis_signals(loop, one, stride, drive)) for one in recordings]
+        return [AxisRegression.of(plant, axis_signals(loop, one, stride, drive, moves)) for one in recordings]
 
     noise = fit_axis_noise(regressions(drive), slow)
     for _ in range(MAX_DRIVE_ROUNDS):
-        later = fit_drive(loop, recordings, regressions(drive), noise, slow, drive)
+        later = fit_drive(loop, recordings, regressions(drive), noise, slow, drive, moves)
         if later == drive:
             break
         drive = later
@@ -161,6 +161,7 @@ def fit_drive(
     noise: AxisNoise,
     slow: float,
     known: DriveLag,
+    moves: AxisMoves | None = None,
 ) -> DriveLag:
     """Return the delay and lag of the force behind u that make the innovations smallest, `known` where none matters.
 
@@ -180,7 +181,7 @@ def fit_drive(
     def cost(x: FloatArray) -> float:
         drive, total, count = DriveLag(*np.abs(x).tolist()), 0.0, 0
         for recording, Q, e, filter, where, runs in fixed:
-            u = axis_signals(loop, recording, stride, drive).u
+            u = axis_signals(loop, recording, stride, drive, moves).force
             column = filter.of_acceleration(u, runs)[where]
             column = column - Q @ (Q.T @ column)
             size = float(column @ column)
@@ -210,8 +211,10 @@ def fit_recording(problem: AxisRegression, noise: AxisNoise, slow: float) -> Axi
     return AxisFit(theta / size, covariance / np.outer(size, size), float(left @ left), len(e))
 
 
-def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | None, list[Message]]:
-    """Learn a healthy axis; None, with a note, where u does not show its inertia.
+def fit_axis(
+    loop: Loop, recordings: Sequence[Recording], moves: AxisMoves | None = None
+) -> tuple[AxisModel | None, list[Message]]:
+    """Learn a healthy axis, at the middle of its covariates; None, with a note, where u does not show its inertia.
 
     A friction that the recordings do not show stays as they have it, and has no faults in the refit. Raises
     NotEnoughError with a recording that hardly moves.
@@ -221,7 +224,7 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
     signals = [axis_signals(loop, one, stride) for one in recordings]
     slow = rest_speed(signals)
     check_motion(recordings, signals, slow, 1 + len(plant.acting))
-    drive, noise, problems = _fit_drive_and_noise(loop, recordings, stride, slow)
+    drive, noise, problems = _fit_drive_and_noise(loop, recordings, stride, slow, moves)
     fits = [fit_recording(one, noise, slow) for one in problems]
     names = ("inertia", *(column.coefficient for column in plant.acting))
     center, of_center = combine_fits(fits, len(names))
@@ -258,6 +261,7 @@ def fit_axis(loop: Loop, recordings: Sequence[Recording]) -> tuple[AxisModel | N
         offset_std=FORCE_OFFSET_SHARE * force,
         drift_std=FORCE_OFFSET_SHARE * force,
         unseen=dict(zip(of_unseen, off[unseen].tolist(), strict=True)),
+        moves=moves,
     )
     model, own_notes = _with_own_limits(loop, model, recordings)
     return model, [*notes, *own_notes]

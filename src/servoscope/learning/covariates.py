@@ -119,6 +119,25 @@ def _stretches(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return covariates (m, k), coefficients (m, n) and their covariances (m, n, n) of all stretches."""
     length = round(STRETCH * pipeline.loop.monitor.memory * pipeline.loop.sample_rate)
+    longest = max(rec.samples for rec in recordings)
+    found = _stretches_of(length, recordings, regressions, fit, names)
+    while not found and length < longest:  # between rests, at a low cutoff, few samples of a stretch count
+        length = min(2 * length, longest)
+        found = _stretches_of(length, recordings, regressions, fit, names)
+    if not found:
+        raise NotEnoughError(f"no stretch of {length} samples with {', '.join(names)}: record longer")
+    c, theta, covariance = (np.array(one) for one in zip(*found, strict=True))
+    return c, theta, covariance
+
+
+def _stretches_of(
+    length: int,
+    recordings: Sequence[Recording],
+    regressions: Sequence[Regression],
+    fit: TuningFit,
+    names: Sequence[str],
+) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    """Return covariates (k,), coefficients (n,) and their covariance (n, n) of each stretch of `length` samples."""
     found = []
     for rec, g in zip(recordings, regressions, strict=True):
         columns = np.column_stack([rec.channels[name] for name in names])
@@ -130,10 +149,7 @@ def _stretches(
                 continue
             theta = least_squares(part)
             found.append((np.nanmean(c, axis=0), theta, coloured_covariance(part, fit.tuning)))
-    if not found:
-        raise NotEnoughError(f"no stretch of {length} samples with {', '.join(names)}: record longer")
-    c, theta, covariance = (np.array(one) for one in zip(*found, strict=True))
-    return c, theta, covariance
+    return found
 
 
 def at_origin(

@@ -11,13 +11,13 @@ from servoscope.baseline.feature_model import (
     WIDENING_SHARE,
     FeatureModel,
     GroupStatistic,
-    SpanFeatures,
     fit_groups,
     score_limit,
     spans_in_a_row,
 )
+from servoscope.baseline.feature_spans import SpanFeatures
 from servoscope.core import outofcore
-from servoscope.core.arrays import FloatArray
+from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.core.messages import Message, message
 from servoscope.estimation.window_features import SPEED_TIME, FeatureLayout, Window, WindowFeatures
 from servoscope.learning.inspection.residual import reference_period
@@ -26,6 +26,7 @@ from servoscope.signals import Recording
 
 MIN_RECORDINGS = 4  # recordings whose scatter is believed; fewer have no features
 BANDS = 7
+PAST_BUDGET = 0.1  # of the budget of false alarms, which the comparison with the own past adds
 MIN_PERIODS_PER_WINDOW = 4.0  # periods of the lowest band in a window
 MAX_FREQUENCY_SHARE = 0.45  # of the sample rate: the highest frequency
 MAX_WINDOWS = 2000  # of a recording that are learned from
@@ -42,30 +43,50 @@ REPEATS = 0.02  # of the variance: the reference repeats where its difference af
 def learn_features(loop: Loop, recordings: Sequence[Recording]) -> tuple[FeatureModel | None, list[Message]]:
     """Learn the features of healthy recordings; None where there are too few recordings, or too short ones."""
     share = loop.monitor.feature_false_alarms
-    if not share or len(recordings) < MIN_RECORDINGS:
+    if not share or len(recordings) < MIN_RECORDINGS + len(loop.columns.covariates):
         return None, []
     layout = choose_layout(loop, recordings)
     runner = WindowFeatures(layout)
     windows = [_windows(runner, one) for one in recordings]
     if not all(windows):
         return None, [message("learning.features_short", window_s=layout.window / layout.sample_rate)]
-    spans = [_spans(each, layout) for each in windows]
+    names = tuple(loop.columns.covariates)
+    conditions = np.array([[np.nanmean(one.channels[name]) for name in names] for one in recordings])
+    spans = [
+        [span._replace(covariates=own) for span in _spans(each, layout)]
+        for each, own in zip(windows, conditions, strict=True)
+    ]
     low, high = _motion_range(spans)
-    left_out = []
-    for i, own in enumerate(spans):
-        groups = fit_groups(windows[:i] + windows[i + 1 :], layout)
+    conditions_of = to_tuples(conditions) if names else ()
+    left_out, past_left_out = [], []
+    for i, own_spans in enumerate(spans):
+        groups = fit_groups(
+            windows[:i] + windows[i + 1 :],
+            spans[:i] + spans[i + 1 :],
+            layout,
+            conditions_of[:i] + conditions_of[i + 1 :],
+        )
         statistics = [GroupStatistic.of(group) for group in groups]
-        left_out.append(max(one.score(s.values[one.level], s.counts[one.level]) for s in own for one in statistics))
-    limit = score_limit(left_out, share)
+        scores = [
+            (one.group.past, one.score(*one.group.pick(span), span.covariates))
+            for span in own_spans
+            for one in statistics
+        ]
+        left_out.append(max(score for past, score in scores if not past))
+        past_left_out += [max(score for past, score in scores if past)] if any(past for past, _ in scores) else []
+    compares_past = len(past_left_out) == len(spans)
+    groups = fit_groups(windows, spans, layout, conditions_of)
     model = FeatureModel(
         layout=layout,
-        groups=fit_groups(windows, layout),
+        groups=tuple(group for group in groups if compares_past or not group.past),
         motion_low=tuple(low),
         motion_high=tuple(high),
         left_out=tuple(left_out),
-        limit=limit,
+        limit=score_limit(left_out, share),
         false_alarms=share,
         in_a_row=spans_in_a_row(layout, share, loop.monitor.false_alarms_per_year),
+        covariates=names,
+        past_limit=score_limit(past_left_out, PAST_BUDGET * share) if compares_past else 0.0,
     )
     return model, []
 
@@ -86,7 +107,7 @@ def _spans(windows: Sequence[Window], layout: FeatureLayout) -> list[SpanFeature
     """Return the spans of a recording; the last one if it is at least half as long as the others."""
     numbers = sorted({window.span for window in windows})
     members = [[window for window in windows if window.span == number] for number in numbers]
-    found = [SpanFeatures.of(each, layout) for each in members]
+    found = [SpanFeatures.of(each, layout, past=True) for each in members]
     return [span for span in found if 2.0 * span.counts[0] >= layout.span] or found[:1]
 
 

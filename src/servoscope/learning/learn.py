@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from servoscope.baseline.axis_model import AxisModel
+from servoscope.baseline.axis_model import AxisModel, AxisMoves
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.feature_model import FeatureModel
 from servoscope.baseline.motion import learn_motion
@@ -104,12 +104,18 @@ def nominal_baseline(loop: Loop, progress: Progress = lambda _: None, duration_s
 
 
 def _learn_axis(healthy: HealthyRecordings) -> tuple[AxisModel | None, list[Message]]:
-    return fit_axis(healthy.loop, healthy.recordings) if isinstance(healthy.loop.plant, AxisPlant) else (None, [])
+    if not isinstance(healthy.loop.plant, AxisPlant):
+        return None, []
+    model = healthy.covariates
+    logged = model is not None and model.warm_up is None
+    moves = AxisMoves(covariates=model, names=healthy.pipeline.bank.names) if logged and model is not None else None
+    return fit_axis(healthy.loop, healthy.recordings, moves)
 
 
 def _learn_features(healthy: HealthyRecordings) -> tuple[FeatureModel | None, list[Message]]:
-    """Features move with covariates too, and nothing says how."""
-    return learn_features(healthy.loop, healthy.recordings) if healthy.covariates is None else (None, [])
+    """Features move with a warm-up that is not logged too, and nothing says how."""
+    hidden = healthy.covariates is not None and healthy.covariates.warm_up is not None
+    return (None, []) if hidden else learn_features(healthy.loop, healthy.recordings)
 
 
 def _assemble_baseline(

@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -81,7 +81,7 @@ class LoopProposal:
     lines: tuple[ProposalLine, ...]
     candidates: tuple[PlantCandidate, ...]
     notes: tuple[Message, ...]
-    origin: str = ""  # the log that it was made from
+    origin: str  # the log that it was made from
 
     def __str__(self) -> str:
         return self.to_toml()
@@ -90,9 +90,9 @@ class LoopProposal:
         """Write the loop file with the reasons as comments; raises OutputError if that fails."""
         atomic_write(Path(path), self.to_toml().encode())
 
-    def to_toml(self, origin: str = "") -> str:
-        """Return the loop file with comments; `origin`: the log that it was made from."""
-        written = [f"# {render(message('init.origin', log=origin or self.origin))}"]
+    def to_toml(self) -> str:
+        """Return the loop file with comments."""
+        written = [f"# {render(message('init.origin', log=self.origin))}"]
         section = ""
         for line in self.lines:
             if line.section != section:
@@ -206,7 +206,7 @@ def propose_loop(paths: Sequence[Path], columns: Columns, where: Mapping[str, st
         ProposalLine("monitor", "frequencies", repr(frequencies), message("init.frequencies")),
         *held,
     )
-    return LoopProposal(loop, lines, candidates, (*notes, *_covariate_notes(path, columns)))
+    return LoopProposal(loop, lines, candidates, (*notes, *_covariate_notes(path, columns)), path.name)
 
 
 def _inspect(recording: Recording, is_speed: bool) -> Inspection:
@@ -241,7 +241,10 @@ def _covariate_notes(path: Path, columns: Columns) -> list[Message]:
 
 
 def init(
-    path: str | Path | Sequence[str | Path], columns: str | None = None, *, where: Mapping[str, str] | None = None
+    path: str | Path | Sequence[str | Path],
+    columns: Columns | str | None = None,
+    *,
+    where: Mapping[str, str] | None = None,
 ) -> LoopProposal:
     """Propose a loop from logs: columns, units, sample rate, plant, cutoff and memory, each with its evidence.
 
@@ -250,7 +253,8 @@ def init(
     path
         The log, or several of one machine.
     columns
-        What is known of columns, as ``"u=cur"``; the others are guessed by the words and units in their names.
+        The columns, or what is known of them, as ``"u=cur"``: the others are guessed by the words and units in their
+        names.
     where
         Rows to take, as for `read`.
 
@@ -268,25 +272,9 @@ def init(
     200.0
     """
     paths = [Path(path)] if isinstance(path, str | Path) else [Path(log) for log in path]
-    proposal = propose_loop(paths, propose_columns(paths[0], list_channels(paths[0]), given=columns), where)
-    return replace(proposal, origin=paths[0].name)
-
-
-def propose(path: str | Path | Sequence[str | Path], columns: Columns | None = None) -> tuple[LoopProposal, Inspection]:
-    """Return a loop for logs, and what `inspect` says of the first one with this loop.
-
-    Parameters
-    ----------
-    path
-        The log, or several of one machine.
-    columns
-        Where the signals stand; None: as the names of the columns suggest.
-
-    Raises RecordingError if the log cannot be read, nothing moves in it, or no name suggests u or y.
-    """
-    paths = [Path(path)] if isinstance(path, str | Path) else [Path(log) for log in path]
-    proposal = propose_loop(paths, columns or propose_columns(paths[0], list_channels(paths[0])))
-    return proposal, inspect(read(paths[0], proposal.loop), proposal.loop)
+    if not isinstance(columns, Columns):
+        columns = propose_columns(paths[0], list_channels(paths[0]), given=columns)
+    return propose_loop(paths, columns, where)
 
 
 def _unwrapped_columns(

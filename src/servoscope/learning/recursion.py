@@ -47,7 +47,7 @@ class HealthyRecordings:
 
 def check_signals(loop: Loop, recording: Recording) -> None:
     """Refuse a recording with stuck, wrapped or exchanged signals, of another sign or unit, or with u at its limits."""
-    if (defect := find_signal_defect(recording)) is not None:
+    if (defect := find_signal_defect(recording, loop.delay)) is not None:
         raise RecordingError(f"{recording.name}: {defect.description}; or leave that part out")
     if loop.plant.has_physics:
         plain = loop.model_copy(update={"monitor": loop.monitor.model_copy(update={"two_stage": "none"})})

@@ -11,6 +11,7 @@ import numpy as np
 from servoscope.core import number_format
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import translate
+from servoscope.diagnosis.change_words import fault_label
 from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
 
 GREEK = {"theta": "θ", "beta": "β", "rho": "ρ"}
@@ -36,6 +37,11 @@ def symbol_parts(name: str) -> tuple[str, str] | None:
     return (letters, index) if letters else None
 
 
+def parameter_label(name: str) -> str:
+    """Return a parameter as its symbol, C_ie, or in words."""
+    return name if symbol_parts(name) else translate(fault_label(name))
+
+
 def text_symbol(name: str) -> str:
     """Return a parameter's name as plain text for a figure; dollar signs are kept from being read as mathematics."""
     match = re.fullmatch(r"(theta|beta|rho)(?:_(\d+))?", name)
@@ -46,8 +52,9 @@ def text_symbol(name: str) -> str:
 
 
 def split_symbols(text: str) -> list[str]:
-    """Return a sentence in parts, every second of which is a parameter's name; factors get a true sign."""
-    return SYMBOL.split(re.sub(r"\bx (?=\d)", "× ", text))
+    """Return a sentence in parts, every second of which is a parameter's name, with true signs of factors."""
+    factors = re.sub(r"\bx (?=\d)", "× ", text)
+    return SYMBOL.split(re.sub(r"(?<=\d) (?=%|m?s\b|Hz\b)", "\N{NO-BREAK SPACE}", factors))
 
 
 def pair_correlation(covariance: Sequence[Sequence[float]]) -> float:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from servoscope.core import messages
 from servoscope.core.errors import OutputError
@@ -34,23 +34,15 @@ BROWSERS = (
 PRINT_S = 120.0  # the longest that printing may take
 FILTERS = {
     "capitalised": lambda text: str(text)[:1].upper() + str(text)[1:],
-    "change": format_values.format_change,
-    "clock_time": format_values.format_clock_time,
-    "correlation": format_values.pair_correlation,
     "count": format_values.format_count,
     "duration": format_values.format_duration,
-    "number": format_values.format_number,
     "percent": format_values.format_percent,
     "plain_name": lambda name: translate(format_values.plain_name(translate(name))),
     "probability": format_values.format_probability,
-    "quantity": format_values.format_quantity,
-    "ratios": lambda fault: format_values.format_ratios(fault.ratio, *fault.interval),
-    "signed_percent": format_values.format_signed_percent,
     "split_symbols": lambda text: format_values.split_symbols(str(text)),
     "symbol_parts": format_values.symbol_parts,
     "word": translate,
     "word_range": lambda cell: type(cell)(translate_range(cell)) if isinstance(cell, str) else cell,  # Markup stays so
-    "with_std": lambda values: format_values.format_with_std(*values),
 }
 
 
@@ -64,6 +56,7 @@ class ResultTable:
     head: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
     words: int = 1
+    kind: ClassVar[str] = "table"
 
     def without(self, *names: str) -> ResultTable:
         """Return the table without some of its columns."""
@@ -89,7 +82,9 @@ def write_page(path: str | Path, content: str) -> None:
     """
     # A file name that is no valid text must not stop the report on the file.
     page = content.encode("utf-8", errors="replace")
-    atomic_write(path, _printed(page, path) if Path(path).suffix.lower() == ".pdf" else page)
+    # nobody unfolds what is on paper
+    printed = Path(path).suffix.lower() == ".pdf"
+    atomic_write(path, _printed(page.replace(b"<details", b"<details open"), path) if printed else page)
 
 
 def find_browser(path: str | Path) -> str:

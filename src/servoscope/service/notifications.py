@@ -137,6 +137,7 @@ class Notifier:
             return []
         found = {"verdict": diagnosis.verdict, "diagnosis": diagnosis.summary, "onset": diagnosis.onset}
         details = {**self._advice(FAULT_ALARM), **found, "faults": diagnosis.document.get("faults", [])}
+        details["checks"] = diagnosis.document.get("checks", [])
         priority = self._alarms.definitions[FAULT_ALARM].priority
         sent = actions.diagnosis_entries(self._settings, alarm, priority, t, now, diagnosis.summary, details)
         return [self._outbox_row(one) for one in sent]

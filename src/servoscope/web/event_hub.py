@@ -18,6 +18,7 @@ import sqlalchemy as sa
 from pydantic_core import to_json
 
 from servoscope.core.errors import StoreError
+from servoscope.core.messages import current_language, current_zone
 from servoscope.service.assets.status import AssetStatus, ServiceStatus
 from servoscope.service.store import Row, Store, tables
 from servoscope.web.schemas.assets import AssetRow, ServiceRow, TransitionRow
@@ -51,9 +52,8 @@ class EventHub:
     events: deque[HubEvent] = field(default_factory=lambda: deque(maxlen=MAX_EVENTS))
     last_number: int = 0  # of the events
     _ticks: dict[str, int] = field(default_factory=dict)  # at which each asset was last new
-    # negative severity, name and text of each asset, made once however far behind readers are
-    _assets: dict[str, tuple[float, str, str]] = field(default_factory=dict)
-    _texts: dict[int, bytes] = field(default_factory=dict)  # the newest tick's event by the reader's last tick
+    # the newest tick's event by the reader's last tick, language and clock
+    _texts: dict[tuple[int, str, object], bytes] = field(default_factory=dict)
     _change: asyncio.Event = field(default_factory=asyncio.Event)
 
     async def run(self) -> None:
@@ -80,9 +80,6 @@ class EventHub:
         self.statuses.update(changed)
         self._ticks.update(dict.fromkeys(changed, self.tick))
         self._texts = {}
-        for stored, status in asset_statuses(changed.values()):
-            row = AssetRow.from_status(stored.name, stored.at, status)
-            self._assets[stored.name] = -row.severity, stored.name, row.model_dump_json()
         for kind, event in events:
             self.last_number += 1
             self.events.append(HubEvent(self.last_number, kind, str(event.asset), format_sse(kind, event)))
@@ -110,20 +107,25 @@ class EventHub:
 
     def events_since(self, tick: int) -> bytes:
         """Return the events that bring a reader up to date who was last served at this tick."""
-        if tick not in self._texts:
+        key = tick, current_language(), current_zone()
+        if key not in self._texts:
             if len(self._texts) > MAX_TEXTS:
                 self._texts = {}
             names = [name for name, changed in self._ticks.items() if changed > tick]
             now, text = time.time(), b""
-            assets = sorted(self._assets[name] for name in names if name in self._assets)
+            assets = [
+                AssetRow.from_status(stored.name, stored.at, status)
+                for stored, status in asset_statuses(self.statuses[name] for name in names)
+            ]
             if assets or tick < 0:
-                rows = ",".join(row for _, _, row in assets)
+                ordered = sorted(assets, key=lambda row: (-row.severity, row.asset))
+                rows = ",".join(row.model_dump_json() for row in ordered)
                 text = f'event: assets\ndata: {{"now":{now!r},"assets":[{rows}]}}\n\n'.encode()
             services = service_statuses(self.statuses[name] for name in names)
             if shown := [ServiceRow.from_status(stored.name, status) for stored, status in services]:
                 text += format_sse("services", {"now": now, "services": shown})
-            self._texts[tick] = text
-        return self._texts[tick]
+            self._texts[key] = text
+        return self._texts[key]
 
     def _read(self) -> tuple[dict[str, StatusEntry], list[tuple[str, TransitionRow | DiagnosisRow]]]:
         """Return the statuses that have changed, and what happened meanwhile; in a thread."""

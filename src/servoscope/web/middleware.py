@@ -25,6 +25,7 @@ CSRF = "x-csrf-token"
 SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
 LOGIN_PATH = f"{API}/session/oidc"
 PUBLIC_PATHS = (f"{API}/session", LOGIN_PATH, CALLBACK)  # asked without login: how one logs in
+CLOCK_COOKIE = "clock"  # the time zone of the browser
 LANGUAGE_COOKIE = "language"  # which the page sets, and whose value is checked
 MAX_BODY_BYTES = 1_000_000  # bytes, but for uploads
 POLICY = (
@@ -81,7 +82,8 @@ class SecurityMiddleware:
 
         try:
             most = self._authorise(scope)
-            with speak(request_language(Headers(scope=scope))):
+            asked = Headers(scope=scope)
+            with speak(request_language(asked), _read_cookie(asked.getlist("cookie"), CLOCK_COOKIE)):
                 await self._app(scope, _limit_body(receive, most), answer)
         except RequestRejection as rejection:
             await problem_response(rejection.status_code, rejection.detail, scope["path"])(scope, receive, answer)

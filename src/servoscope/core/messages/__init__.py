@@ -26,6 +26,7 @@ from contextvars import ContextVar
 from datetime import UTC, datetime
 from importlib.resources import files
 from typing import Annotated, Any
+from zoneinfo import ZoneInfo
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, field_validator
 
@@ -42,6 +43,7 @@ __all__ = [
     "clock_of",
     "count_words",
     "current_language",
+    "current_zone",
     "format_moment",
     "languages",
     "message",
@@ -83,6 +85,7 @@ LANGUAGE = next((each for each in languages() if each == os.environ.get(SETTING,
 
 
 _spoken: ContextVar[str | None] = ContextVar("spoken", default=None)
+_zone: ContextVar[ZoneInfo | None] = ContextVar("zone", default=None)
 
 
 def current_language() -> str:
@@ -90,14 +93,26 @@ def current_language() -> str:
     return _spoken.get() or LANGUAGE
 
 
+def current_zone() -> ZoneInfo | None:
+    """Return the time zone of the reader of `speak`; None: dates are in UTC and say so."""
+    return _zone.get()
+
+
 @contextlib.contextmanager
-def speak(name: str) -> Iterator[None]:
-    """Speak another language than the process for a while, in this thread or task and those that it starts."""
-    before = _spoken.set(name)
+def speak(name: str, zone: str | None = None) -> Iterator[None]:
+    """Speak another language than the process for a while, in this thread or task and those that it starts.
+
+    `zone`: the reader's time zone, as ``Europe/Berlin``; one that this machine does not know is not used.
+    """
+    found = None
+    with contextlib.suppress(ValueError, OSError):
+        found = ZoneInfo(zone) if zone else None
+    before, clock = _spoken.set(name), _zone.set(found)
     try:
         yield
     finally:
         _spoken.reset(before)
+        _zone.reset(clock)
 
 
 _began: ContextVar[float | None] = ContextVar("began", default=None)
@@ -211,7 +226,10 @@ def _format_probability(value: float) -> str:
 
 
 def _format_utc(value: float) -> str:
+    zone = _zone.get()
     try:
+        if zone is not None:  # which the page names
+            return f"{datetime.fromtimestamp(value, zone):%Y-%m-%d %H:%M:%S}"
         return f"{datetime.fromtimestamp(value, UTC):%Y-%m-%d %H:%M:%S} UTC"
     except (OverflowError, OSError, ValueError):  # a clock that was set to what is in no calendar
         return f"{value:.0f} s"
@@ -308,8 +326,9 @@ def translate(words: str, language: str | None = None) -> str:
     if language == "en":
         return words
     known = catalogue(language)
-    if f"word.{words}" in known:
-        return known[f"word.{words}"]
+    for spelling in (words, words.replace(" ", "_")):  # names of faults are written either way
+        if f"word.{spelling}" in known:
+            return known[f"word.{spelling}"]
     if " + " in words:  # a pair of faults
         return " + ".join(translate(each, language) for each in words.split(" + "))
     what, bracket, unit = words.partition(" [")

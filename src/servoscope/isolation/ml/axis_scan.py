@@ -9,9 +9,8 @@ import numpy as np
 
 from servoscope.baseline.axis_model import AxisModel
 from servoscope.baseline.baseline import Baseline
-from servoscope.core.arrays import FloatArray
 from servoscope.isolation.ml.axis_vibration import BANDS, MIN_AMPLITUDE_RATIO, AxisVibration, find_vibration
-from servoscope.isolation.ml.axis_window import AxisWindow
+from servoscope.isolation.ml.axis_window import LONG_RUN_S, AxisWindow
 from servoscope.isolation.ml.hypothesis import HypothesisFit, fit_hypothesis
 from servoscope.isolation.ml.onset import ChangeCosts
 from servoscope.isolation.ml.window import ChangeProfile
@@ -21,9 +20,12 @@ from servoscope.models.plants.axis import AxisPlant
 from servoscope.signals import Recording
 
 FALSE_ALARMS = 1e-4  # share of healthy recordings that are called changed
-EDGE_SHARE = 0.05  # of a stretch at both ends, in which no onset is looked for
+EDGE_SHARE = 0.05  # of a stretch, in which no onset is looked for at its beginning, and at most at its end
+MIN_END_SHARE = 0.01  # and at least at its end
+END_S = 2.0 * LONG_RUN_S  # of motion that a change at the end has: scores hang together for half of that
 MAX_ONSETS = 400  # that are tried
 MAX_SAMPLES = 40_000  # samples of a stretch
+DETECTION_SAMPLES = 4  # of the window, within which the time of a detection is found
 HEALTHY_MARGIN = 1.5  # times as far as the furthest, a further healthy recording may well come
 
 
@@ -66,7 +68,7 @@ def _named_change(window: AxisWindow, found: _ChangeFit, limit: float, enough: f
     if vibration is None and found.gain <= limit:
         return None
     onset = found.changed.profile.onset
-    told = vibration.detected if vibration else max(found.detection(limit), onset)
+    told = vibration.detected if vibration else max(found.detection(window, limit), onset)
     ends = vibration.onset if vibration else (onset, onset, onset)
     low, at, high = (window.first_sample + window.stride * k for k in ends)
     within = vibration and replace(vibration, onset=(low, at, high))
@@ -100,7 +102,7 @@ def scan_limit(faults: int, false_alarms: float = FALSE_ALARMS) -> float:
     1 - t (James, James and Siegmund, 1987), times the number of faults.
     """
     x = np.linspace(5.0, 60.0, 2000)
-    range_ = 2.0 * np.log((1.0 - EDGE_SHARE) / EDGE_SHARE)
+    range_ = sum(np.log((1.0 - edge) / edge) for edge in (EDGE_SHARE, MIN_END_SHARE))
     probability = faults * np.sqrt(x / (2.0 * np.pi)) * np.exp(-x / 2.0) * (range_ * (1.0 - 1.0 / x) + 2.0 / x)
     return float(x[np.argmax(probability <= false_alarms)])
 
@@ -118,16 +120,21 @@ class _ChangeFit:
         """Twice the logarithm of their likelihood ratio."""
         return (self.healthy.cost - self.changed.cost) / self.variance
 
-    def detection(self, enough: float) -> int:
-        """Return the sample at which what had been measured by then was enough.
+    def detection(self, window: AxisWindow, enough: float) -> int:
+        """Return the sample at which what had been measured by then was enough: up to it, the axis is fitted anew.
 
-        The last one where only the past does: a change lowers its sum too, for the healthy axis no longer stands in
-        for it.
+        The fit to the whole stretch would not do: where a change comes early, healthy parameters stand in for it.
         """
-        since, N = self.changed.profile.onset, self.healthy.profile.onset  # which never comes
-        lowered: FloatArray = np.cumsum(self.healthy.residual[:N] ** 2 - self.changed.residual[:N] ** 2)
-        reached = lowered[since:] - lowered[since] >= enough * self.variance
-        return since + int(np.argmax(reached)) if reached.any() else N - 1
+        since, N = self.changed.profile.onset, window.samples
+        low, high = since, N - 1  # not enough, enough
+        while high - low > DETECTION_SAMPLES:
+            middle = (low + high) // 2
+            past, at = window.cut(0, middle + 1), ChangeProfile(since)
+            healthy = fit_hypothesis(past, [], ChangeProfile(N), self.healthy.d, [np.zeros(0)], free=True)
+            changed = fit_hypothesis(past, self.changed.faults, at, self.changed.d, [self.changed.x], free=True)
+            reached = healthy.cost - changed.cost >= enough * self.variance
+            low, high = (low, middle) if reached else (middle, high)
+        return high
 
 
 def _stretches(loop: Loop, model: AxisModel, recording: Recording) -> Iterator[AxisWindow]:
@@ -143,7 +150,8 @@ def _likeliest_change(window: AxisWindow, faults: tuple[Fault, ...]) -> _ChangeF
     healthy = fit_hypothesis(window, [], never, np.zeros(m), [np.zeros(0)], free=True)
     moving = np.cumsum(window.counted)
     share = moving / max(moving[-1], 1)
-    inside = np.flatnonzero((share >= EDGE_SHARE) & (share <= 1.0 - EDGE_SHARE) & window.counted)
+    end = float(np.clip(END_S * window.sample_rate / max(moving[-1], 1), MIN_END_SHARE, EDGE_SHARE))
+    inside = np.flatnonzero((share >= EDGE_SHARE) & (share <= 1.0 - end) & window.counted)
     if len(inside) < MAX_ONSETS // 10 or not faults:
         return None
     onsets = inside[:: max(1, len(inside) // MAX_ONSETS)]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from servoscope.baseline.axis_model import AxisModel
+from servoscope.baseline.axis_model import AxisModel, AxisMoves
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.jit import minimum, where
@@ -43,6 +43,7 @@ class AxisWindow(ChangeWindow):
     plant: AxisPlant
     model: AxisModel
     rate: float
+    factors: FloatArray | None  # what covariates multiply the columns by, shape (1 + n, N)
 
     systematic = 2e-2  # the terms are simpler than friction is
     size_error = 2e-2
@@ -59,7 +60,7 @@ class AxisWindow(ChangeWindow):
     def of_healthy(cls, loop: Loop, model: AxisModel, recording: Recording, first: int = 0) -> AxisWindow:
         """Return all of a recording of a healthy axis; it begins at sample `first` of a longer one."""
         assert isinstance(loop.plant, AxisPlant)
-        signals = axis_signals(loop, recording, model.stride, model.drive)
+        signals = axis_signals(loop, recording, model.stride, model.drive, model.moves)
         each = [np.linalg.inv(np.linalg.cholesky(np.array(model.covariance)))] if model.parameters else []
         m = len(model.parameters)
         prior = np.zeros((m + 2, m + 2))
@@ -75,6 +76,7 @@ class AxisWindow(ChangeWindow):
             signals.restart,
             model,
             signals.sample_rate,
+            signals.factors,
         )
 
     @property
@@ -105,7 +107,7 @@ class AxisWindow(ChangeWindow):
     @cached_property
     def signals(self) -> AxisSignals:
         """The samples of the window."""
-        return AxisSignals(self.u, self.y, self.restart, self.rate, self.plant.derivative)
+        return AxisSignals(self.u, self.y, self.restart, self.rate, self.plant.derivative, self.factors)
 
     @cached_property
     def columns(self) -> FloatArray:
@@ -246,16 +248,25 @@ class AxisWindow(ChangeWindow):
 
     def cut(self, first: int, end: int) -> AxisWindow:
         """Return samples `first` to `end` of it."""
-        return replace(super().cut(first, end))  # what was computed of the whole is left behind
+        factors = None if self.factors is None else self.factors[:, first:end]
+        return replace(super().cut(first, end), factors=factors)  # what was computed of the whole is left behind
 
 
-def axis_signals(loop: Loop, recording: Recording, stride: int, drive: DriveLag = NO_LAG) -> AxisSignals:
-    """Return a recording as the filter of an axis takes it; `drive`: how late the force is beyond the loop's delay."""
+def axis_signals(
+    loop: Loop, recording: Recording, stride: int, drive: DriveLag = NO_LAG, moves: AxisMoves | None = None
+) -> AxisSignals:
+    """Return a recording as the filter of an axis takes it.
+
+    `drive`: how late the force is beyond the loop's delay; `moves`: how covariates move the coefficients.
+    """
+    plant = loop.plant
+    assert isinstance(plant, AxisPlant)
     restart = recording.restart.copy()
     restart[0] = True
     u = delay_input(plant_input(loop, recording.u), restart, round(loop.delay * loop.sample_rate))
     u = drive.of_input(u, restart, loop.sample_rate)
-    return AxisSignals.thinned(u, recording.y, restart, loop.sample_rate, stride, loop.plant.derivative)
+    factors = None if moves is None else moves.factors(plant, recording.channels)
+    return AxisSignals.thinned(u, recording.y, restart, loop.sample_rate, stride, plant.derivative, factors)
 
 
 @ArrayFunction

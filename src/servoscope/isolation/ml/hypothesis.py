@@ -18,6 +18,7 @@ MIN_SIZE_STDS = 3.0  # standard deviations below which a size is as good as none
 SIZE_STDS = 5.0  # standard deviations of the size over which its likelihood is integrated
 POINTS = 31
 BOUND_TOLERANCE = 1e-6
+BOUND_SHARE = 1e-3  # of the logarithmic range, within which a size lies at its end
 START_LOGARITHM = 1e-4  # of all logarithms where a search begins
 EPSILON = float(np.finfo(np.float64).eps)
 # of the sum of squares: what is further off than the best one has no probability worth telling
@@ -47,6 +48,14 @@ class HypothesisFit:
     def has_free_nuisances(self) -> bool:
         """Whether the healthy parameters followed."""
         return bool(self.jacobian.shape[1] == len(self.d) + len(self.x))
+
+    @property
+    def faults_at_ends(self) -> list[Fault]:
+        """The faults whose sizes lie at an end of their ranges."""
+        low, high = log_ratio_bounds(self.faults)
+        near = BOUND_SHARE * (high - low)
+        at_end = (self.x <= low + near) | (self.x >= high - near)
+        return [fault for fault, at in zip(self.faults, at_end, strict=True) if at]
 
     def intervals(self, noise_variance: float) -> tuple[tuple[float, float], ...]:
         """Return 95 % intervals of x within the ranges, for innovations of a variance."""

@@ -37,6 +37,8 @@ MAX_LOOKS = 4  # for the onset, each with the sizes that fit the one before
 ONSET_MISFIT_VARIANCES = 100.0  # variances by which a fit at another onset is worse if that onset is none
 MIN_LOOK_GAIN = 1.0  # of the sum of squares that a look gained, for another one
 MAX_PAIR_MISFIT = 10.0  # of what noise leaves unexplained at most, from which a pair is not followed to its onset
+WIDE_RATIO_RANGE = (0.02, 500.0)  # of a fault whose best size lies at an end of its own range
+MAX_WIDER_SEARCHES = 3  # each with more faults of that range: one, then a pair
 MAX_SHARP_ONSET_SAMPLES = 20  # samples of an onset's interval, up to which the step is loud
 
 
@@ -60,9 +62,7 @@ class RefitResult:
 
     window: ChangeWindow  # what it looked at
     hypotheses: tuple[Hypothesis, ...]  # most probable first
-    other_parameters: tuple[
-        HypothesisFit, ...
-    ]  # parameters outside the list of faults, each as if it alone had changed
+    other_parameters: tuple[HypothesisFit, ...]  # outside the list of faults, each as if it alone had changed
     unknown_probability: float  # probability that it is none of the hypotheses
     goodness: GoodnessOfFit  # of the most probable one
     onset: OnsetEstimate  # onset, in samples of the window
@@ -105,18 +105,36 @@ def fit_hypotheses(
 
     Maximum likelihood on the innovations of the exact sampled plant (Ljung, 1999, chapter 7), so that sizes scatter as
     little as the Cramer-Rao bound allows; the healthy parameters are free as far as the baseline does not know them.
-
     The search for the onset starts at the sample `onset` and ends at that of the alarm, `announced`.
     """
     faults = baseline.plant.all_faults
     if baseline.axis is not None:
         faults = baseline.axis.visible_faults(faults)
-    return _HypothesisSearch(onset_window(baseline, recording, onset, last), faults, onset, announced, progress).run()
+    return _search(onset_window(baseline, recording, onset, last), faults, onset, announced, progress)
 
 
 def fit_stretch(window: ChangeWindow, faults: Sequence[Fault], progress: Callable[[], None]) -> RefitResult:
     """Fit every fault and every pair to a window in which the plant differs from healthy from the first sample on."""
-    return _HypothesisSearch(window, faults, window.first_sample, window.first_sample, progress).run()
+    return _search(window, faults, window.first_sample, window.first_sample, progress)
+
+
+def _search(
+    window: ChangeWindow, faults: Sequence[Fault], onset: int, announced: int, progress: Callable[[], None]
+) -> RefitResult:
+    """Search, with wider ranges while the best size lies at the end of one: a pair stands in for a severe fault there.
+
+    What lies at the end of the widest range has no name.
+    """
+    for _ in range(MAX_WIDER_SEARCHES):
+        result = _HypothesisSearch(window, faults, onset, announced, progress).run()
+        ends = [fault for fault in result.best.fitted.faults_at_ends if fault.ratio_range != WIDE_RATIO_RANGE]
+        if not ends:
+            break
+        faults = [replace(fault, ratio_range=WIDE_RATIO_RANGE) if fault in ends else fault for fault in faults]
+    named = [replace(h, probability=0.0) if h.fitted.faults_at_ends else h for h in result.hypotheses]
+    unknown = result.unknown_probability + sum(h.probability for h in result.hypotheses if h.fitted.faults_at_ends)
+    named.sort(key=lambda hypothesis: -hypothesis.probability)  # stable: where all vanish, the likeliest stays first
+    return replace(result, hypotheses=tuple(named), unknown_probability=unknown)
 
 
 class _HypothesisSearch:
@@ -125,7 +143,7 @@ class _HypothesisSearch:
     ) -> None:
         self.window, self.faults, self.progress = window, faults, progress
         # a ray is several parameters at once already: pairs are made of the plant's own faults
-        self.rays = tuple(ray.fault for ray in window.plant.rays)
+        self.rays = {ray.fault.name for ray in window.plant.rays}
         self.latest = min((announced - window.first_sample) // window.stride, window.samples - 1)
         self.initial_onset = max(min((onset - window.first_sample) // window.stride, self.latest), 0)
         self.profile = ChangeProfile(self.initial_onset)
@@ -140,7 +158,7 @@ class _HypothesisSearch:
         self.profile = found.profile
         pairs = [
             self._fit([*one.faults, *other.faults], nothing, [np.append(one.x, 0.0), np.append(0.0, other.x)])
-            for one, other in combinations([f for f in singles if f.faults[0] not in self.rays], 2)
+            for one, other in combinations([f for f in singles if f.faults[0].name not in self.rays], 2)
         ]
         found, best = self._iterate_onset(found, [*singles, *pairs])
         everything = [best] if self._is_hopeless(best) else self._follow_onset([*singles, *pairs])
@@ -255,10 +273,7 @@ class _HypothesisSearch:
         return fit_hypothesis(self.window, faults, self.profile, d, starts, free=self.window.follows)
 
     def _refit_contenders(self, fitted: Sequence[HypothesisFit]) -> list[HypothesisFit]:
-        """Let the healthy parameters follow: a second fault that stands in for their error must not outrun the first.
-
-        Under a large fault they matter.
-        """
+        """Let the healthy parameters follow: a second fault must not outrun the first in the place of their error."""
         self.progress()
         followed = refit_contenders_jointly(self.window, fitted, self.noise_variance)
         best = self._update_noise_variance(followed)
@@ -310,9 +325,8 @@ class _HypothesisSearch:
         if not self.window.follows or abs(found.profile.onset - begin) <= MAX_SHARP_ONSET_SAMPLES:
             return found
         # a size that is large, and healthy parameters that follow, are not linear so far from where they were fitted
-        is_worse = (
-            self._refit_at(fitted, found.profile).cost > fitted.cost + ONSET_MISFIT_VARIANCES * self.noise_variance
-        )
+        most = fitted.cost + ONSET_MISFIT_VARIANCES * self.noise_variance
+        is_worse = self._refit_at(fitted, found.profile).cost > most
         return OnsetEstimate(fitted.profile, begin, begin, found.size_std) if is_worse else found
 
     def _weigh(self, fitted: Sequence[HypothesisFit], found: OnsetEstimate) -> RefitResult:

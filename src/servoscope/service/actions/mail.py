@@ -130,7 +130,9 @@ def _subject(event: dict[str, Any]) -> str:
 
 def _describe_event(event: dict[str, Any], address: str | None) -> str:
     details = event.get("details", {})
-    texts = (_subject(event), event.get("cause"), details.get("consequence"), details.get("operator_action"))
+    checks = details.get("checks")
+    action = render(message("service.mail.checks", checks=checks)) if checks else details.get("operator_action")
+    texts = (_subject(event), event.get("cause"), action, details.get("consequence"))
     lines = [str(text) for text in texts if text]
     lines.append(render(message("service.mail.time", t=event["time"])))
     if address is not None:

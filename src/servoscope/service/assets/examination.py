@@ -48,7 +48,8 @@ class StoredDiagnosis(BaseModel):
 
     def columns(self) -> dict[str, Any]:
         """Return its columns in the table of diagnoses."""
-        return {"verdict": self.verdict, "summary": self.summary, "onset": self.onset, "document": self.document}
+        document = {**self.document, "said": self.headline.model_dump(mode="json")}
+        return {"verdict": self.verdict, "summary": self.summary, "onset": self.onset, "document": document}
 
     def with_onset(self, onset: float | None) -> StoredDiagnosis:
         """Return it with the onset [UTC s] that an earlier window has found, if its own window begins after that."""
@@ -122,11 +123,7 @@ def examine_blocks(
     first = 0 if exam.alarm.all() else len(exam.alarm) - int(np.argmin(exam.alarm[::-1]))
     crossed = int(exam.estimates.crossed[first]) - 1
     onset = start + float(recording.t[crossed if crossed >= 0 else int(exam.estimates.index[first])])
-    excess = float((exam.statistic / baseline.thresholds.statistic)[first:].max())
-    level = message("service.examination.level", level=float(exam.estimates.level[first:].max()))
-    headline = message(
-        "service.examination.fault", excess=excess, level=level if baseline.thresholds.hypotheses else None
-    )
+    headline = message("service.examination.fault")
     size = _follow_size(exam, fault, first) if fault is not None else None
     return StoredDiagnosis(verdict="fault", headline=headline, onset=onset, size=size)
 
@@ -180,7 +177,7 @@ def diagnose_blocks(baseline: Baseline, name: str, blocks: Sequence[Block]) -> S
     since = diagnosis.onset_s[1] if diagnosis.onset_s is not None else None
     onset = start + since if since is not None else None
     signature = signature_columns(recording, baseline.loop, since)
-    document = {"began": start, "signature": signature, **diagnosis.model_dump(mode="json")}
+    document = {**diagnosis.model_dump(mode="json"), "began": start, "signature": signature}
     headline = diagnosis.dated_headline(start)
     return StoredDiagnosis(verdict=diagnosis.verdict, headline=headline, onset=onset, document=document)
 

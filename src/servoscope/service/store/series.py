@@ -20,7 +20,7 @@ from servoscope.core.errors import StoreError
 from servoscope.core.settings_errors import suggest_name
 from servoscope.prognosis.series import NORMAL_95, SizeSeries
 from servoscope.service.store import tables
-from servoscope.service.store.rows import NOTE, Row
+from servoscope.service.store.rows import CHECKS, NOTE, Row
 from servoscope.service.store.store import Store
 
 Series = FloatArray  # of a fault or coefficient: t, value, low, high, healthy, shape (5, N)
@@ -98,6 +98,14 @@ def read_notes(store: Store, asset: str) -> list[Row]:
     query = sa.select(table.c.who, table.c.document).where(table.c.asset == asset, table.c.what == NOTE)
     notes = [{"who": row["who"], **row["document"]} for row in store.fetch(query.order_by(table.c.id))]
     return sorted(notes, key=lambda note: float(note["t"]))
+
+
+def read_checks(store: Store, asset: str) -> dict[str, Row]:
+    """Return what people have written to be checked on an asset, by fault: `texts`, with `who` and `at`."""
+    table = tables.audit
+    query = sa.select(table.c.who, table.c.at, table.c.document).where(table.c.asset == asset, table.c.what == CHECKS)
+    rows = store.fetch(query.order_by(table.c.id))
+    return {row["document"]["fault"]: {**row["document"], "who": row["who"], "at": row["at"]} for row in rows}
 
 
 def last_renewal(store: Store, asset: str) -> float | None:

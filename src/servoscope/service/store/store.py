@@ -25,7 +25,7 @@ from servoscope.service.store.bundles import (
     read_samples,
     write_bundles,
 )
-from servoscope.service.store.rows import NOTE, CommandOutcome, Row
+from servoscope.service.store.rows import CHECKS, NOTE, CommandOutcome, Row
 
 Result = TypeVar("Result")
 OPENING_S = 5.0  # how long a writer tries to open a file that another process is preparing
@@ -322,14 +322,14 @@ class Store:
             return connection.execute(chosen.delete().where(old), of_assets).rowcount
 
     def delete_events(self, service: str, assets: Sequence[str], before: float) -> dict[str, int]:
-        """Delete audit, executed commands and finished deliveries of a service that are older [UTC s]; notes stay.
+        """Delete audit, executed commands, finished deliveries of a service that are older [UTC s]; notes, texts stay.
 
         Returns how many rows of which table.
         """
         audit, commands, outbox = tables.audit.c, tables.commands.c, tables.outbox.c
         names = [service, *assets]
         old = {
-            tables.audit: (audit.at < before) & audit.asset.in_(names) & (audit.what != NOTE),
+            tables.audit: (audit.at < before) & audit.asset.in_(names) & audit.what.not_in((NOTE, CHECKS)),
             tables.commands: (commands.at < before) & commands.asset.in_(names) & commands.outcome.is_not(None),
             tables.outbox: (outbox.created < before)
             & outbox.due.is_(None)

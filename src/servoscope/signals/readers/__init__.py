@@ -2,6 +2,22 @@
 
 from servoscope.signals.readers.addresses import is_address
 from servoscope.signals.readers.formats import readable_suffixes
-from servoscope.signals.readers.recording_file import ChannelInfo, as_recording, list_channels, read, read_parts
+from servoscope.signals.readers.recording_file import (
+    ChannelInfo,
+    as_recording,
+    list_channels,
+    read,
+    read_parts,
+    read_rows,
+)
 
-__all__ = ["ChannelInfo", "as_recording", "is_address", "list_channels", "read", "read_parts", "readable_suffixes"]
+__all__ = [
+    "ChannelInfo",
+    "as_recording",
+    "is_address",
+    "list_channels",
+    "read",
+    "read_parts",
+    "read_rows",
+    "readable_suffixes",
+]

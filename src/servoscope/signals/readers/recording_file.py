@@ -115,6 +115,11 @@ def read_parts(
     """Read several recordings out of one file, one per value of the column `by`, in the order of appearance.
 
     Parameters and errors are those of `read`; a recording is called ``file.csv[run=6]``. Without `by`, there is one.
+
+    Examples
+    --------
+    >>> [part.name for part in read_parts("friday.csv", "loop.toml")]
+    ['friday.csv']
     """
     loop = None if loop is None else Loop.of(loop)
     columns = columns or (loop.columns if loop is not None else Columns())
@@ -128,6 +133,27 @@ def read_log(path: str | Path, loop: Loop, by: str | None = None) -> Log:
     Raises RecordingError if the file cannot be used, LoopError if a column is not a linear combination of channels.
     """
     return _read_log(path, loop, loop.columns, {}, by)
+
+
+def read_rows(
+    source: Source, columns: Columns | None = None, where: Mapping[str, str] | None = None, by: str | None = None
+) -> dict[str, Samples]:
+    """Read rows without judging them, by the recording's name: signals may be constant, and values may be missing.
+
+    Parameters and errors are those of `read_parts`.
+    """
+    parts = _read_log(source, None, columns or Columns(), where or {}, by).parts.values()
+    return {part.name: part.samples() for part in parts}
+
+
+def read_channels(path: Source, columns: Columns) -> tuple[str, FloatArray, dict[str, FloatArray]]:
+    """Return the name of a file, its time stamps [s] as logged (N,), and the covariates of `columns`, (N,) each.
+
+    Raises RecordingError if the file cannot be used, LoopError if a column is not a linear combination of channels.
+    """
+    rows = _read_log(path, None, columns, {}, None).parts[""]
+    (t, *_), _, channels = rows.split_columns()
+    return rows.name, t, channels
 
 
 def first_time(path: str | Path, loop: Loop) -> float:
@@ -255,7 +281,7 @@ class LoggedRows:
         labels: tuple[str, str, str],
         target: ResampleTarget | None,
     ) -> None:
-        self._name, self._has_time, self._channels = name, timed, channels
+        self.name, self._has_time, self._channels = name, timed, channels
         self._loop, self._labels, self._target = loop, labels, target if timed else None
         self._columns: list[GrowableArray] = []
         self._broken: list[tuple[int, float, int, str]] = []
@@ -277,7 +303,7 @@ class LoggedRows:
     def _rate(self) -> float | None:
         return self._loop.sample_rate if self._loop is not None else None
 
-    def _split_columns(self) -> tuple[list[FloatArray], FloatArray | None, dict[str, FloatArray]]:
+    def split_columns(self) -> tuple[list[FloatArray], FloatArray | None, dict[str, FloatArray]]:
         """Return t, r, u and y; the runs, if there are some; the channels."""
         columns = [column.to_array() for column in self._columns]
         if not self._has_time:
@@ -293,8 +319,8 @@ class LoggedRows:
         """
         if self._target is not None:
             return self.recording()
-        (t, *signals), run, channels = self._split_columns()
-        axis = build_time_axis(t, run, self._rate, self._name)
+        (t, *signals), run, channels = self.split_columns()
+        axis = build_time_axis(t, run, self._rate, self.name)
         r, u, y = map(axis.reorder, signals)
         return Samples.from_columns(
             axis.t, r, u, y, channels={name: axis.reorder(channel) for name, channel in channels.items()}
@@ -302,7 +328,7 @@ class LoggedRows:
 
     def dated_recording(self, log: Log) -> Recording:
         """Return the rows cleaned; time stamps that are seconds since 1970 count from the first of them."""
-        (t, *signals), run, each = self._split_columns()
+        (t, *signals), run, each = self.split_columns()
         began = log.origin
         if not began and t.size and MIN_EPOCH_S < t[0] < MAX_EPOCH_S:
             began = float(np.floor(t[0]))
@@ -314,7 +340,7 @@ class LoggedRows:
 
     def recording(self) -> Recording:
         """Return the rows cleaned."""
-        signals, run, each = self._split_columns()
+        signals, run, each = self.split_columns()
         return self._clean(signals, run, each)
 
     def _clean(self, signals: list[FloatArray], run: FloatArray | None, each: dict[str, FloatArray]) -> Recording:
@@ -322,7 +348,7 @@ class LoggedRows:
         limits = self._loop.input_limits if self._loop is not None else None
         notes = [self._note(*torn, t) for torn in self._broken]
         options = {"sample_rate": self._rate, "run": run, "limits": limits, "labels": self._labels, "channels": each}
-        recording = clean(t, r, u, y, name=self._name, target=self._target, **options)  # type: ignore[arg-type]
+        recording = clean(t, r, u, y, name=self.name, target=self._target, **options)  # type: ignore[arg-type]
         if not self._has_time:
             text = message("defect.no_time", rate=recording.sample_rate)
             notes.append(Defect("clock", float(recording.t[0]), float(recording.t[-1]), recording.samples, text))

@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from servoscope.assessment.assess import assess
+from servoscope.assessment.tags import find_loops
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import RecordingError
 from servoscope.core.workers import Progress
@@ -24,7 +26,7 @@ from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.diagnosis.motion_signature import signature_columns
 from servoscope.estimation.frequency_response import ResponseRow, response_rows
 from servoscope.learning import inspection
-from servoscope.learning.proposal import propose
+from servoscope.learning.proposal import init
 from servoscope.models.loop import Columns, Loop
 from servoscope.report import plain_values
 from servoscope.signals import Recording, readers
@@ -94,17 +96,30 @@ def inspect_file(
     return _inspection_result(inspection.inspect(recording, settings), recording)
 
 
+def assess_file(progress: Progress, file: str, request: requests.InspectionRequest) -> JsonObject:
+    """Return what is most likely wrong with a loop, from one log without a baseline; of several loops of the first."""
+    found = find_loops(open_file(file).columns)
+    columns = _merge_columns(request.columns, None) if request.columns is not None else next(iter(found.values()))
+    ((name, samples),) = readers.read_rows(file, columns, request.where).items()
+    first = -math.inf if request.from_s is None else request.from_s
+    last = math.inf if request.to_s is None else request.to_s
+    progress("assessing")
+    result = assess(samples[(samples.t >= first) & (samples.t < last)], name=name)
+    return {"assessment": plain_values.to_plain_values(result)}
+
+
 def propose_file(progress: Progress, file: str, request: requests.ProposalRequest) -> JsonObject:
     """Propose a loop file for a recording as `servoscope init` does, and inspect the recording with it."""
     progress("proposing")
     columns = _merge_columns(request.columns, None) if request.columns is not None else None
-    proposal, result = propose(file, columns)
+    proposal = init(file, columns)
+    recording = readers.read(file, proposal.loop)
     lines = [
         {"section": one.section, "key": one.key, "value": one.value, "why": str(one.why), "doubtful": one.doubtful}
         for one in proposal.lines
     ]
-    found = _inspection_result(result, readers.read(file, proposal.loop))
-    return {"toml": proposal.to_toml(file), "lines": lines, **found}
+    found = _inspection_result(inspection.inspect(recording, proposal.loop), recording)
+    return {"toml": proposal.to_toml(), "lines": lines, **found}
 
 
 def _inspection_result(result: inspection.Inspection, recording: Recording) -> JsonObject:

@@ -58,7 +58,7 @@ export async function show(main, { session, signal, linked, values }) {
   }
 
   function row(one) {
-    const answer = one.response_time_s ? `within ${duration(one.response_time_s)}` : "";
+    const answer = one.response_time_s ? `answer within ${duration(one.response_time_s)}` : "";
     const todo = [one.operator_action, one.consequence && `else: ${one.consequence}`].filter(Boolean).join("; ");
     const until = one.state === "shelved" && one.until ? ` until ${moment(one.until, { seconds: false })}` : "";
     return [
@@ -67,7 +67,7 @@ export async function show(main, { session, signal, linked, values }) {
       `${STATES[one.state]}${until}`,
       h("span", { class: "t", title: `${duration(now - one.since)} ago` }, moment(one.since)),
       one.cause ? h("span", {}, prose(one.cause)) : DASH,
-      h("span", {}, todo || DASH, answer && h("small", {}, ` ${answer}`)),
+      one.checks.length ? h("ul", { class: "why" }, one.checks.flatMap((check) => check.texts.map((text) => h("li", {}, prose(text)))), answer && h("li", {}, h("small", {}, answer))) : h("span", {}, todo || DASH, answer && h("small", {}, ` ${answer}`)),
       commands(one, session, heard),
     ];
   }

@@ -22,6 +22,8 @@ const NAVIGATION = [
   ["/learn", "Learn", ["learn"]],
   ["/design", "Design", ["design"]],
 ];
+const ZONE = Intl.DateTimeFormat().resolvedOptions().timeZone;
+document.cookie = `clock=${ZONE}; path=/; max-age=31536000; samesite=strict`; // dates in sentences are of this clock too
 const [name, ...rest] = location.pathname.slice(1).split("/").map(decodeURIComponent);
 const left = new AbortController();
 const theme = h("button", { type: "button", class: "quiet theme", onclick: change });
@@ -73,6 +75,7 @@ function surround() {
       h("a", { class: "brand", href: "/" }, h("img", { src: "/static/icon.svg", alt: "", width: "22", height: "22" }), "servoscope"),
       h("nav", { "aria-label": "Pages" }, pages),
       link,
+      h("span", { class: "person", title: "All times are of this time zone", translate: "no" }, ZONE),
       person,
       LANGUAGES.length > 1 && languageSwitch(),
       theme,

@@ -5,15 +5,16 @@ import { bode } from "./bode.js";
 import { plot } from "./charts.js";
 import { commands, STATES } from "./commands.js";
 import { signals as drawn, signature, tests } from "./curves.js";
-import { candidates, mimics } from "./diagnosis.js";
-import { h, section, table, tell, titled } from "./dom.js";
+import { editor } from "./checks.js";
+import { evidence, outline, refresh, verdict } from "./document.js";
+import { h, section, table, tell, titled, translate } from "./dom.js";
 import { growth } from "./growth.js";
 import { follow } from "./live.js";
-import { badge, mark, priority, prose, say, STATUS, VERDICTS } from "./marks.js";
+import { badge, priority, prose, STATUS, VERDICTS } from "./marks.js";
 import { parameters } from "./parameters.js";
 import { periods } from "./periods.js";
 import { planes } from "./planes.js";
-import { capital, count, DASH, duration, moment, multiple, number, plain, size } from "./words.js";
+import { capital, count, DASH, moment, multiple, number, plain } from "./words.js";
 
 const SPANS = { "1 h": 3600, "24 h": 86400, "7 d": 604800, "30 d": 2592000, "1 y": 31536000 };
 const SIGNALS = { "30 s": 30, "10 min": 600, "1 h": 3600 };
@@ -25,15 +26,14 @@ export async function show(main, { session, signal, linked, values, part: name, 
   const path = `/assets/${part(name)}`;
   let asset = await get(path, signal);
   const units = asset.about.units ?? {};
-  const verdict = verdictOf(name);
+  const top = topOf(session, path, signal);
   const about = [asset.about.loop, asset.about.plant && `plant ${asset.about.plant}`, asset.about.point, asset.about.sample_rate_hz && `${asset.about.sample_rate_hz} Hz`].filter(Boolean).join(", ");
   const plane = planes(asset.responses, units.response ?? "", signal);
   const sizes = parameters(asset.parameters);
   const grown = growth(path, name, () => asset, { session, values, signal });
   const said = h("p", { class: "working", role: "status" });
   const [standing, past, diagnoses, counted] = [h("div", {}), h("div", {}), h("div", {}), h("p", { class: "note" })];
-  const sure = h("div", {});
-  const certainty = section("How sure, and what else it could be", null, sure);
+  const certainty = h("div", {});
   const [response, motion, widths] = [h("div", { class: "plot" }), h("div", { class: "plot" }), h("p", { class: "note" })];
   const signed = section("Motion signature", "Mean input over position, forward (solid) and backward (dashed), and over speed: the gap between the two directions is friction.", motion, widths);
   const compared = periods(path, () => asset, values, signal);
@@ -45,23 +45,28 @@ export async function show(main, { session, signal, linked, values, part: name, 
 
   main.replaceChildren(
     h("div", { class: "head" }, h("h1", {}, name), h("span", { class: "note" }, about), h("span", { class: "gap" }), baseline, h("button", { type: "button", class: "screen", onclick: () => print() }, "Print")),
-    verdict.element,
+    top.element,
+    certainty,
     h(
       "div",
       { class: "columns" },
-      grown.element,
-      certainty,
-      section("Inverse frequency response", "Input per unit of output, as a complex number: the diamond is healthy, the dot is now, its ellipse holds 95 %. Each panel has its own scales.", plane.element),
-      section("Inverse response over frequency", "Magnitude and phase, before (healthy) and now, with the band that holds 95 %.", response),
-      signed,
-      half(titled("Distance from healthy", spans, statistic)),
-      half(titled("Signals", lengths, samples)),
-      half(section("Coefficients", "Against what a healthy loop would show under the same reference.", sizes.element)),
-      compared.element,
       half(section("Alarms", null, standing, said, past)),
       half(section("Diagnoses", null, diagnoses)),
+      grown.element,
+      half(titled("Signals", lengths, samples)),
+      signed,
+      compared.element,
       half(section("Stream", null, counted)),
     ),
+    h("details", { class: "experts" }, h("summary", {}, "For experts"), h(
+      "div",
+      { class: "columns" },
+      top.tests,
+      section("Inverse frequency response", "Input per unit of output, as a complex number: the diamond is healthy, the dot is now, its ellipse holds 95 %. Each panel has its own scales.", plane.element),
+      section("Inverse response over frequency", "Magnitude and phase, before (healthy) and now, with the band that holds 95 %.", response),
+      half(titled("Distance from healthy", spans, statistic)),
+      half(section("Coefficients", "Against what a healthy loop would show under the same reference.", sizes.element)),
+    )),
   );
 
   // Live parts first: they need nothing but what is there already.
@@ -102,28 +107,20 @@ export async function show(main, { session, signal, linked, values, part: name, 
   }
 
   async function look() {
-    const [alarms, found, advice] = await Promise.all([get(query(`${path}/alarms`, { last: 50 }), signal), get(query("/diagnoses", { asset: name, last: 20 }), signal), get("/alarms", signal)]);
+    const [alarms, found] = await Promise.all([get(query(`${path}/alarms`, { last: 50 }), signal), get(query("/diagnoses", { asset: name, last: 20 }), signal)]);
     past.replaceChildren(steps(alarms.transitions, false));
     diagnoses.replaceChildren(list(found.diagnoses));
-    verdict.advise(advice.alarms.find((one) => one.asset === name && one.alarm === "fault")?.operator_action);
     const inFull = found.diagnoses.filter((one) => one.grounds === "full");
     await explain(inFull.at(-1), inFull.find((one) => one.t >= began(asset)));
     await grown.load();
   }
 
-  // The candidates of the last full diagnosis; the numbers behind them are on its own page.
+  // The motion by the last full diagnosis, beside that of the first one of this fault.
   async function explain(row, first) {
     signed.hidden = !moved || asset.verdict !== "fault";
-    certainty.hidden = !row || asset.verdict !== "fault";
-    if (certainty.hidden || sure.dataset.id === row.id) return;
-    sure.dataset.id = row.id;
-    const full = await get(`/diagnoses/${part(row.id)}`, signal);
-    const said = full.document ?? {};
-    await compareMotion(full, first);
-    sure.replaceChildren(
-      h("p", { class: "note" }, `By the full diagnosis of ${moment(row.t)}: `, h("a", { href: `/diagnoses/${part(row.id)}` }, "all of it, with the reasons"), "."),
-      ...[said.candidates?.length && candidates(full, said), said.refit?.mimics?.length && mimics(said)].filter(Boolean),
-    );
+    if (!row || asset.verdict !== "fault" || signed.dataset.id === row.id) return;
+    signed.dataset.id = row.id;
+    await compareMotion(await get(`/diagnoses/${part(row.id)}`, signal), first);
   }
 
   // Now is the newest full diagnosis; before, the first one of this fault, whose window holds its onset.
@@ -168,7 +165,10 @@ export async function show(main, { session, signal, linked, values, part: name, 
   function take(next) {
     const moved = next.t !== live.t.at(-1);
     asset = next;
-    verdict.update(asset);
+    if (top.update(asset)) {
+      const full = asset.diagnosis && h("p", { class: "note" }, `By the full diagnosis of ${moment(asset.diagnosis.t)}: `, h("a", { href: `/diagnoses/${part(asset.diagnosis.id)}` }, "all of it, with the reasons"), ".");
+      certainty.replaceChildren(...evidence(asset.sections), ...(full ? [full] : []));
+    }
     sizes.update(asset.parameters);
     plane.take(asset.responses, asset.t, began(asset));
     if (moved && asset.statistic !== null) {
@@ -210,13 +210,6 @@ function began({ verdict, onset, since }) {
   return verdict === "fault" ? (onset ?? since) : null;
 }
 
-// What is known of a fault once it has a name; before that, what the service says.
-function told(asset) {
-  if (asset.verdict !== "fault" || !asset.sizes.length) return asset.summary;
-  const each = asset.sizes.map((one) => `${one.parameter} is ${number(one.ratio, 4)} times its healthy value (95 %: ${number(one.low, 4)} to ${number(one.high, 4)})`);
-  return `${capital(each.join(", "))}${asset.sized ? ` on ${moment(asset.sized)}` : ""}.`;
-}
-
 const half = (element) => (element.classList.add("half"), element);
 
 // Columns over time, with what is known of a part of them more closely in its place.
@@ -232,44 +225,21 @@ function relative({ t, r, u, y }) {
   return { t: t.map((at) => at - end), r, u, y };
 }
 
-// The verdict: a shape, a headline, a sentence, and facts at fixed places.
-function verdictOf(name) {
-  const kind = h("p", { class: "kind" });
-  const headline = h("h2", {});
-  const summary = h("p", { class: "summary" });
-  const facts = Object.fromEntries(["since", "size", "statistic", "level", "data", "last"].map((key) => [key, { value: h("b", {}), more: h("small", {}) }]));
-  const names = { since: "Since", size: "How large", statistic: "Statistic T², × limit", level: "Sequential test, × limit", data: "Data", last: "Last sample" };
-  const advice = h("p", { class: "advice" });
-  const advise = (words) => say(advice, words ? `What to check: ${words}.` : "");
-  const element = h("div", { class: "verdict", "aria-label": `Verdict on ${name}`, role: "region" }, kind, headline, summary, advice, h("dl", { class: "facts" }, Object.entries(facts).map(([key, one]) => h("div", {}, h("dt", {}, names[key]), h("dd", {}, one.value, one.more)))));
-  const put = (key, value, more = "") => (say(facts[key].value, value), tell(facts[key].more, more));
-  let look = "";
+// The verdict and what to check, drawn anew where it changes; beside it, for experts, how far both tests are from their limits.
+function topOf(session, path, signal) {
+  const [element, status, tests] = [h("div", {}), h("p", { class: "note" }), h("p", { class: "note" })];
+  let shown = "";
   const update = (asset) => {
-    const now = [asset.verdict, asset.ne107, ...asset.reasons].join();
-    if (look !== now) {
-      look = now;
-      element.className = `verdict ${asset.verdict}`;
-      kind.replaceChildren(mark(asset.verdict), VERDICTS[asset.verdict], badge(asset.ne107, `NE 107: ${STATUS[asset.ne107]}${asset.reasons.length ? `, for ${asset.reasons.map(plain).join(", ")}` : ""}`));
-    }
-    tell(headline, headlineOf(asset));
-    say(summary, told(asset));
-    const since = began(asset) ?? asset.since;
-    put("since", moment(since), `for ${duration(asset.t - since)}${asset.verdict === "fault" ? ", onset as estimated" : ""}`);
-    const found = asset.sizes.map((one) => [one.parameter, ...size({ ...one, interval: [one.low, one.high] })]);
-    put("size", found.map(([parameter, value]) => `${parameter} ${value}`).join(", ") || DASH, found.length ? `95 %: ${found.map(([, , low, high]) => `${low} to ${high}`).join(", ")}` : asset.verdict === "fault" && asset.awaited.length ? "the full diagnosis is under way" : "no fault that is named");
-    put("statistic", multiple(asset.statistic), asset.statistic >= 1 ? "above its limit" : "alarm at 1");
-    put("level", multiple(asset.level), asset.level >= 1 ? "above its limit" : "alarm at 1");
-    put("data", capital(asset.quality.map(plain).join(", ") || "sound"), `${count(asset.counted.lost)} blocks lost`);
-    put("last", moment(asset.t).slice(11), moment(asset.t).slice(0, 10));
+    tests.textContent = translate(`Statistic T², × limit: ${multiple(asset.statistic)}; sequential test, × limit: ${multiple(asset.level)}; alarm at 1.`);
+    status.replaceChildren(badge(asset.ne107, `NE 107: ${STATUS[asset.ne107]}${asset.reasons.length ? `, for ${asset.reasons.map(plain).join(", ")}` : ""}`), ` ${translate("Last sample")}: ${moment(asset.t)}`);
+    const now = outline(asset.verdict, [...asset.sections, asset.checks]);
+    if (element.querySelector("form :focus")) return false;
+    if (now === shown) return refresh(element, asset.sections);
+    shown = now;
+    element.replaceChildren(verdict(asset.verdict, asset.sections, editor(path, asset.checks, session, signal)), status);
+    return true;
   };
-  return { element, update, advise };
-}
-
-function headlineOf(asset) {
-  if (asset.verdict === "healthy") return "No change from the healthy baseline";
-  if (asset.verdict === "undetermined") return "Nothing can be told for the time being";
-  if (asset.sizes.length) return capital(asset.sizes.map((one) => one.words.replace(/ \(.*/, "")).join(" and "));
-  return "The actuator has changed";
+  return { element, tests, update };
 }
 
 function current(alarms, session, answered) {

@@ -1,5 +1,6 @@
 // A recording from a file to its verdict: drop it, see what is in it, say which column is what, compare it with a baseline.
 import { get, job, mayChange, part, query } from "./api.js";
+import { assessed } from "./assessment.js";
 import { list } from "./asset.js";
 import { during, field, h, section } from "./dom.js";
 import { inspected } from "./inspection.js";
@@ -33,6 +34,7 @@ function steps(one, baselines, wanted, signal) {
   const said = h("div", { role: "status", class: "working" });
   const result = h("div", {});
   const look = h("button", { type: "button" }, "Inspect");
+  const assess = h("button", { type: "button" }, "Assess without a baseline");
   const diagnose = h("button", { type: "button", class: "first", disabled: !baselines.length }, "Diagnose");
 
   const repoint = () => {
@@ -53,6 +55,12 @@ function steps(one, baselines, wanted, signal) {
       shown.draw();
     });
   look.addEventListener("click", () => during(look, said, inspect));
+  assess.addEventListener("click", () =>
+    during(assess, said, async (step) => {
+      const { assessment } = await job("/assessments", part(), { signal, step });
+      result.replaceChildren(section("What is wrong, without a baseline", null, assessed(assessment)));
+    }),
+  );
   diagnose.addEventListener("click", () =>
     during(diagnose, said, async (step) => {
       const { diagnosis } = await job("/diagnoses", { ...part(), baseline: baseline.value, ...(point.value && { point: point.value }) }, { signal, step });
@@ -65,7 +73,7 @@ function steps(one, baselines, wanted, signal) {
     preview(one),
     columns.element,
     h("div", { class: "fields" }, baselines.length ? field("Compare with the baseline", baseline) : h("p", { class: "complaint" }, "There is no baseline yet: ", h("a", { href: `/begin?upload=${encodeURIComponent(one.id)}` }, "begin with a log of the healthy machine"), "."), pointed, field("From [s]", from), field("To [s]", to)),
-    h("div", { class: "actions" }, diagnose, look, said),
+    h("div", { class: "actions" }, diagnose, look, assess, said),
   );
   kept(one.id, asked);
   if (columns.read().input && columns.read().output) during(look, said, inspect);

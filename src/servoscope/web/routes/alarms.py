@@ -9,13 +9,17 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Response
 from starlette.exceptions import HTTPException
 
-from servoscope.service.alarms import alarm_kind
+from servoscope.service.alarms import FAULT_ALARM, alarm_kind
+from servoscope.service.assets.status import AssetStatus, ServiceStatus
 from servoscope.service.store.queries import query_history
+from servoscope.web.checks import asset_checks, last_full_diagnosis
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
 from servoscope.web.schemas import assets as schemas
+from servoscope.web.schemas.checks import FaultCheck
 from servoscope.web.schemas.requests import AssetQuery, AuditQuery, CommandName, CommandRequest, TransitionQuery
 from servoscope.web.schemas.responses import AuditEntry, AuditList
 from servoscope.web.statuses import read_statuses, service_statuses
+from servoscope.web.stored_diagnosis import stored_headline
 
 router = APIRouter(tags=["alarms"], dependencies=[VIEWER])
 
@@ -32,19 +36,28 @@ def list_alarms(context: ContextDep, query: Annotated[AssetQuery, Query()]) -> s
     floods = (status.flood for _, status in service_statuses(statuses.values()))
     return schemas.AlarmList(
         now=time.time(),
-        alarms=[_with_advice(context, row) for row in rows],
+        alarms=[_with_advice(context, row, statuses[row.asset].status) for row in rows],
         flood=next((flood for flood in floods if flood.since is not None), None),
     )
 
 
-def _with_advice(context: Context, row: schemas.AlarmRow) -> schemas.AlarmDetail:
-    """Return an alarm with what the service file says of it; nothing where the server has no such file."""
+def _with_advice(context: Context, row: schemas.AlarmRow, status: AssetStatus | ServiceStatus) -> schemas.AlarmDetail:
+    """Return an alarm with what the service file says of it; of a fault with what to check, and since when."""
     definition = context.config.alarms.definitions.get(alarm_kind(row.alarm)) if context.config is not None else None
+    known, checks = dict(row), list[FaultCheck]()
+    if row.alarm == FAULT_ALARM and isinstance(status, AssetStatus):
+        full = last_full_diagnosis(context, row.asset)
+        checks = asset_checks(context, row.asset, status, full)
+        if full is not None:
+            known["cause"] = stored_headline(full)
+        if status.verdict == "fault":  # its alarm's state is younger once somebody has answered
+            known["since"] = status.onset if status.onset is not None else status.since
     return schemas.AlarmDetail(
-        **dict(row),
+        **known,
         consequence=definition.consequence if definition is not None else None,
         operator_action=definition.operator_action if definition is not None else None,
         response_time_s=definition.response_time_s if definition is not None else None,
+        checks=checks,
     )
 
 

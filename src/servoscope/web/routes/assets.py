@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import sqlalchemy as sa
 from fastapi import APIRouter, Query
 from starlette.exceptions import HTTPException
 
@@ -17,15 +16,18 @@ from servoscope.design.operating_limits import OperatingLimit, operating_limits
 from servoscope.prognosis.forecast import prognose
 from servoscope.service.assets.status import AssetStatus
 from servoscope.service.sources.block import Block
-from servoscope.service.store import Store, tables
+from servoscope.service.store import Store
 from servoscope.service.store.queries import query_downsampled, query_history
-from servoscope.service.store.rows import NOTE
+from servoscope.service.store.rows import CHECKS, NOTE
 from servoscope.service.store.series import FAULT_KINDS, query_sizes, read_notes, read_series, thin_columns
+from servoscope.web.asset_document import has_open_fault
+from servoscope.web.checks import asset_checks, asset_loop, fault_checks, last_full_diagnosis
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
 from servoscope.web.downsample import signal_columns
 from servoscope.web.routes.baselines import asset_baseline_id, find_baseline, load_cached
 from servoscope.web.schemas import assets as schemas
 from servoscope.web.schemas import sizes
+from servoscope.web.schemas.checks import CheckRequest, FaultCheck
 from servoscope.web.schemas.requests import (
     FleetQuery,
     HistoryQuery,
@@ -35,7 +37,6 @@ from servoscope.web.schemas.requests import (
     SizeQuery,
     TrendQuery,
 )
-from servoscope.web.schemas.responses import DiagnosisRow
 from servoscope.web.statuses import StatusEntry, asset_statuses, read_statuses, service_statuses
 
 router = APIRouter(tags=["assets"], dependencies=[VIEWER])
@@ -54,10 +55,10 @@ def find_asset(context: Context, asset: str) -> tuple[StatusEntry, AssetStatus]:
 
 def build_asset_detail(context: Context, asset: str, at: float, status: AssetStatus) -> schemas.AssetDetail:
     """Return all that is known of an asset now."""
-    query = sa.select(tables.diagnoses).where(tables.diagnoses.c.asset == asset)
-    newest = context.store.fetch(query.order_by(tables.diagnoses.c.t.desc()).limit(1))
-    diagnosis = DiagnosisRow.from_stored(newest[0]) if newest else None
-    return schemas.AssetDetail.build(asset, at, status, baseline=asset_baseline_id(context, asset), diagnosis=diagnosis)
+    row = last_full_diagnosis(context, asset) if has_open_fault(status) else None
+    checks = asset_checks(context, asset, status, row)
+    baseline = asset_baseline_id(context, asset)
+    return schemas.AssetDetail.build(asset, at, status, baseline=baseline, row=row, checks=checks)
 
 
 @router.get("/assets")
@@ -142,6 +143,14 @@ def add_note(context: ContextDep, who: Operator, asset: str, request: NoteReques
     find_asset(context, asset)
     context.store.add_audit(who.user, asset, NOTE, request.model_dump())
     return sizes.Note(who=who.user, **request.model_dump())
+
+
+@router.post("/assets/{asset}/checks")
+def write_checks(context: ContextDep, who: Operator, asset: str, request: CheckRequest) -> list[FaultCheck]:
+    """Write what to check on it for a fault, in words of one's own; the audit keeps who did, and what was there."""
+    find_asset(context, asset)
+    context.store.add_audit(who.user, asset, CHECKS, request.model_dump())
+    return fault_checks(context, asset, asset_loop(context, asset), [request.fault])
 
 
 @router.get("/assets/{asset}/trend")

@@ -13,8 +13,15 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 from starlette.status import HTTP_202_ACCEPTED
 
+from servoscope.diagnosis.checks import suspects
+from servoscope.diagnosis.result import Diagnosis
+from servoscope.report.diagnosis_document import DiagnosisContext, diagnosis_document
+from servoscope.report.document import to_json
+from servoscope.service.assets.status import AssetMetadata
 from servoscope.service.store import tables
 from servoscope.service.store.queries import query_history
+from servoscope.service.store.series import read_checks
+from servoscope.web.checks import asset_loop, fault_checks
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
 from servoscope.web.jobs.queue import Job
 from servoscope.web.middleware import API
@@ -23,6 +30,7 @@ from servoscope.web.schemas import responses
 from servoscope.web.schemas.assets import signal_units
 from servoscope.web.schemas.requests import DiagnosisQuery, DiagnosisRequest
 from servoscope.web.statuses import asset_statuses, read_statuses
+from servoscope.web.stored_diagnosis import read_diagnosis
 
 router = APIRouter(tags=["diagnoses"], dependencies=[VIEWER])
 
@@ -89,36 +97,57 @@ def _asset_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
     if not rows:
         raise HTTPException(404, f"there is no diagnosis {id_}")
     document = dict(rows[0]["document"])
-    began, signature = document.pop("began", None), document.pop("signature", [])
+    diagnosis = read_diagnosis(document)
+    began, signature, _ = document.pop("began", None), document.pop("signature", []), document.pop("said", None)
     facts = next((one.metadata for _, one in asset_statuses(read_statuses(context.store, [asset]).values())), None)
     baseline = None
     if facts is not None and facts.model_fields_set:
         # the baseline that the asset has now: the store does not know which one it had then
         baseline = responses.BaselineRef(id=asset_baseline_id(context, asset), name=asset, hash=facts.baseline or "")
+    known = _asset_context(context, asset, diagnosis, facts)._replace(began=began, onset=rows[0]["onset"])
     return responses.DiagnosisDetail(
         **dict(responses.DiagnosisRow.from_stored(rows[0])),
         began=began,
         signature=signature,
         document=document,
-        words=facts.faults if facts is not None else {},
+        sections=to_json(diagnosis_document(diagnosis, known)) if diagnosis is not None else [],
         baseline=baseline,
         units=signal_units(facts.units) if facts is not None else None,
-        coefficient_units=list(facts.coefficient_units) if facts is not None else [],
     )
+
+
+def _asset_context(
+    context: Context, asset: str, diagnosis: Diagnosis | None, facts: AssetMetadata | None
+) -> DiagnosisContext:
+    """Return what the diagnosis of an asset does not know itself."""
+    loop, own = asset_loop(context, asset), read_checks(context.store, asset)
+    names = suspects(diagnosis.current) if diagnosis is not None else ()
+    checks = None
+    if loop is not None or any(name in own for name in names):
+        checks = [text for check in fault_checks(context, asset, loop, names) for text in check.texts]
+    if facts is None:
+        return DiagnosisContext(checks=checks)
+    coefficients = dict(
+        zip(diagnosis.parameters if diagnosis is not None else (), facts.coefficient_units, strict=False)
+    )
+    y, u = facts.units or ("", "")
+    return DiagnosisContext(words=facts.faults, units=(y, u), coefficient_units=coefficients, checks=checks)
 
 
 def _upload_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
     record = context.storage.read(responses.UploadDiagnosis, id_.removeprefix(UPLOAD_PREFIX))
     path = context.storage.path(responses.UploadDiagnosis, record.id) / "data.json"
     data = responses.DiagnosisData.model_validate_json(path.read_bytes())
+    coefficients = {one.name: one.unit for one in data.trace.parameters}
+    y, u = data.units
+    known = DiagnosisContext(words=data.words, units=(y, u), coefficient_units=coefficients)
     return responses.DiagnosisDetail(
         **dict(_upload_row(record)),
         document=data.document,
-        words=data.words,
+        sections=to_json(diagnosis_document(Diagnosis.model_validate(data.document), known)),
         who=record.who,
         baseline=record.baseline,
         units=signal_units(data.units),
-        coefficient_units=[one.unit for one in data.trace.parameters],
         signals=data.signals,
         trace=data.trace,
         signature=data.signature,

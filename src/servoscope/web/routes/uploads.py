@@ -105,6 +105,15 @@ async def start_inspection(context: ContextDep, who: Operator, request: Inspecti
     )
 
 
+@router.post("/assessments", status_code=HTTP_202_ACCEPTED)
+async def start_assessment(context: ContextDep, who: Operator, request: InspectionRequest) -> JobResponse:
+    """Find out what is most likely wrong with a loop, from one log without a baseline; a job."""
+    file = await asyncio.to_thread(context.storage.upload, request.upload)
+    return context.jobs.submit(
+        Job("assessment", who.user, "assess_file", (file.name, request), file.parent, (), None, lambda result: result)
+    )
+
+
 @router.post("/proposals", status_code=HTTP_202_ACCEPTED)
 async def start_proposal(context: ContextDep, who: Operator, request: ProposalRequest) -> JobResponse:
     """Propose a loop file for an upload, with the evidence for each line, and inspect the upload with it; a job."""

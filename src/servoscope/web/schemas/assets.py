@@ -13,12 +13,16 @@ from pydantic import Field
 from servoscope.diagnosis.result import Verdict
 from servoscope.estimation.frequency_response import CHI2_95_2DOF, ResponseRow
 from servoscope.prognosis.series import NORMAL_95
+from servoscope.report.document import to_json
 from servoscope.service.alarms import PRIORITIES, TRANSITION_TABLE, LifecycleEvent, LifecycleState, Ne107
 from servoscope.service.alarms.state_table import UNACKNOWLEDGED_STATES
 from servoscope.service.assets.outlook import Outlook
 from servoscope.service.assets.status import AlarmStatus, AssetStatus, FloodCounts, ServiceStatus
+from servoscope.web.asset_document import asset_document, status_headline
+from servoscope.web.schemas.checks import FaultCheck
 from servoscope.web.schemas.requests import CommandName
-from servoscope.web.schemas.responses import ApiResponse, DiagnosisRow, NullableFloats, SignalColumns
+from servoscope.web.schemas.responses import ApiResponse, DiagnosisRow, JsonObject, NullableFloats, SignalColumns
+from servoscope.web.stored_diagnosis import read_diagnosis, stored_headline
 
 COMMAND_NAMES: tuple[CommandName, ...] = get_args(CommandName)
 NE107_RANKS: tuple[Ne107, ...] = get_args(Ne107)
@@ -49,6 +53,7 @@ class AlarmDetail(AlarmRow):
     consequence: str | None
     operator_action: str | None
     response_time_s: float | None
+    checks: list[FaultCheck]
 
 
 class AlarmList(ApiResponse):
@@ -144,6 +149,7 @@ class AssetRow(ApiResponse):
         alarms = alarm_rows(name, status.alarms)
         derived = {
             "asset": name,
+            "summary": status_headline(status),
             "group": status.metadata.group,
             "source": status.metadata.source,
             "quality": list(status.quality),
@@ -236,13 +242,24 @@ class AssetDetail(AssetRow):
     baseline: str | None
     awaited: tuple[int, ...]
     diagnosis: DiagnosisRow | None
+    sections: list[JsonObject]
+    checks: list[FaultCheck]
     window_s: float | None
 
     @classmethod
     def build(
-        cls, name: str, at: float, status: AssetStatus, *, baseline: str | None, diagnosis: DiagnosisRow | None
+        cls,
+        name: str,
+        at: float,
+        status: AssetStatus,
+        *,
+        baseline: str | None,
+        row: Mapping[str, Any] | None,
+        checks: list[FaultCheck],
     ) -> AssetDetail:
-        """Return an asset with the id of its baseline and its newest diagnosis."""
+        """Return an asset with the id of its baseline, the row of its last full diagnosis, and what to check."""
+        full = read_diagnosis(row["document"]) if row is not None else None
+        texts = [text for check in checks for text in check.texts]
         metadata = status.metadata
         return cls(
             **dict(AssetRow.from_status(name, at, status)),
@@ -254,7 +271,9 @@ class AssetDetail(AssetRow):
             about=AssetFacts.model_validate({**dict(metadata), "units": signal_units(metadata.units)}),
             baseline=baseline,
             awaited=status.pending_diagnoses,
-            diagnosis=diagnosis,
+            diagnosis=DiagnosisRow.from_stored(row) if row is not None else None,
+            sections=to_json(asset_document(status, full, texts, stored_headline(row) if row is not None else "")),
+            checks=checks,
             window_s=metadata.window_s,
         )
 

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from servoscope.diagnosis.result import Verdict
 from servoscope.service.access import Role
+from servoscope.web.stored_diagnosis import stored_headline
 
 JsonObject = dict[str, Any]  # a document of another package, passed on as it is
 NullableFloats = list[float | None]
@@ -222,7 +223,8 @@ class DiagnosisRow(ApiResponse):
     @classmethod
     def from_stored(cls, row: Mapping[str, Any]) -> DiagnosisRow:
         """Return a diagnosis of a followed asset, a row of the store."""
-        return cls.model_validate({**row, "id": f"{row['asset']}@{row['number']}"})
+        said = stored_headline(row)
+        return cls.model_validate({**row, "summary": said, "id": f"{row['asset']}@{row['number']}"})
 
 
 class DiagnosisList(ApiResponse):
@@ -235,12 +237,11 @@ class DiagnosisDetail(DiagnosisRow):
     """A diagnosis with its document; uploads have signals, trace and report too."""
 
     document: JsonObject
-    words: dict[str, str]
+    sections: list[JsonObject]
     began: float | None = None
     who: str | None = None
     baseline: BaselineRef | None
     units: dict[str, str] | None
-    coefficient_units: list[str]
     signals: SignalColumns | None = None
     trace: TraceColumns | None = None
     signature: list[SignatureColumns] = []

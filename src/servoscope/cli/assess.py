@@ -1,0 +1,99 @@
+"""The command that assesses logs without a baseline."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from servoscope.cli import arguments
+from servoscope.cli.app import app
+from servoscope.cli.exit import FailureCounter, print_json
+from servoscope.cli.options import JsonOption, ReadingOptions, ReportOption, with_reading_options
+from servoscope.cli.output_paths import REPORTS, OutputPaths, check_output, recording_stem
+from servoscope.cli.progress import show_steps
+
+if TYPE_CHECKING:
+    from servoscope.assessment import Assessment
+    from servoscope.signals.samples import Samples
+
+
+@app.command()
+@with_reading_options("axis", "resample")
+def assess(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG", help="Logs, folders, or exports with many tags.")],
+    travel: Annotated[
+        str | None, typer.Option(metavar="LOW,HIGH", help="Range of u, for sizes in % of travel; 0,100 for example.")
+    ] = None,
+    *,
+    reading: ReadingOptions,
+    as_json: JsonOption = False,
+    report: ReportOption = None,
+    work_list: Annotated[
+        Path | None, typer.Option("--csv", metavar="FILE.csv", help="Write a work list, the worst loop first.")
+    ] = None,
+) -> None:
+    """Say from one log of a loop, without a baseline, what is most likely wrong; rank the loops of a folder."""
+    logs = arguments.expand_files(logs)
+    check_output(report, "--report", REPORTS, logs, folder=True)
+    check_output(work_list, "--csv", (".csv",), logs)
+    limits = arguments.parse_range(travel, "--travel")
+
+    from servoscope.assessment import assess as assess_log
+    from servoscope.assessment import plant_loops
+    from servoscope.cli.render import assessment, results
+    from servoscope.core.files import atomic_write
+    from servoscope.report import assessment_page
+    from servoscope.report.plain_values import to_plain_values
+
+    reader = arguments.RecordingReader.from_options(None, reading)
+    pages = OutputPaths.from_option(report, ".html", len(logs) > 1 or reading.by is not None, logs)
+    out, failures = results.create_console(), FailureCounter()
+    judged: list[Assessment] = []
+    with show_steps(len(logs), 2) as steps:
+        for path in logs:
+            steps.begin(path.name)
+            with failures.catch():
+                for name, samples in read_loops(path, reader):
+                    steps.advance("assessing")
+                    result = assess_log(samples, name=name, travel=limits)
+                    judged.append(result)
+                    if pages is not None:
+                        target = pages.path(recording_stem(path, name))
+                        assessment_page.write_assessment_page(target, result)
+                        with steps.pause():
+                            results.print_written_path(results.create_console(stderr=as_json), target)
+    ranked = plant_loops.rank(judged)
+    if as_json:
+        for result in ranked:
+            print_json(to_plain_values(result), lines=len(ranked) > 1)
+    elif len(ranked) == 1:
+        assessment.print_assessment(out, ranked[0])
+    elif ranked:
+        assessment.print_ranking(out, ranked)
+    if work_list is not None:
+        table, text = assessment.ranking_table(ranked), io.StringIO()
+        csv.writer(text).writerows([table.head, *table.rows])
+        atomic_write(work_list, text.getvalue().encode())
+        results.print_written_path(results.create_console(stderr=as_json), work_list)
+    failures.exit_if_any()
+
+
+def read_loops(path: Path, reader: arguments.RecordingReader) -> Iterator[tuple[str, Samples]]:
+    """Yield the loops in a file with their names: by the mapping, or by the names of its columns."""
+    from servoscope.assessment.tags import find_loops
+    from servoscope.signals.readers.frames import open_source
+    from servoscope.signals.readers.recording_file import read_rows
+
+    given = reader.columns
+    loops = {"": given} if given is not None else find_loops(open_source(path, reader.text).columns)
+    first, last = reader.span
+    for tag, columns in loops.items():
+        columns = columns.model_copy(update={"text": reader.text or columns.text})
+        for name, samples in read_rows(path, columns, reader.where, reader.by).items():
+            rows = samples if reader.span == arguments.UNBOUNDED else samples[(samples.t >= first) & (samples.t < last)]
+            yield f"{name}[{tag}]" if len(loops) > 1 else name, rows

@@ -1,0 +1,39 @@
+"""Assessments in a terminal: one log in full, several as a ranking with groups that share a period."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.padding import Padding
+from rich.text import Text
+
+from servoscope.assessment import Assessment
+from servoscope.assessment.plant_loops import group_by_period
+from servoscope.cli.render.results import INDENT, print_facts, print_notes, print_result_table, print_title
+from servoscope.core.messages import translate
+from servoscope.report.assessment_page import assessment_size, facts, index_table, ranking_table
+from servoscope.report.page import say
+
+__all__ = ["print_assessment", "print_ranking", "ranking_table"]
+
+
+def print_assessment(out: Console, a: Assessment) -> None:
+    """Print verdict, probability, reason, the evidence and what to do."""
+    print_title(out, a.recording, f": {assessment_size(a)}")
+    colour = {"good": "green", "cannot tell": "yellow"}.get(a.verdict, "red")
+    head = translate(a.verdict)
+    words = f"{head[:1].upper()}{head[1:]} ({a.probability:.2f}): {a.reason}"
+    out.print(Padding(Text(words, style=f"bold {colour}"), INDENT, expand=False))
+    print_facts(out, facts(a))
+    if a.indices:
+        print_result_table(out, index_table(a))
+    print_notes(out, [a.advice], "green", "-")
+
+
+def print_ranking(out: Console, ranked: Sequence[Assessment]) -> None:
+    """Print the worst loops first, and which of them oscillate together."""
+    print_result_table(out, ranking_table(ranked))
+    for group in group_by_period(ranked):
+        names = [a.recording for a in group]
+        print_notes(out, [say("assess.group", names=names, period=group[0].period_s, source=names[0])])

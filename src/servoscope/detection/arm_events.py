@@ -1,0 +1,91 @@
+"""Short torques from outside, as of a push or a collision: found in what the healthy arm leaves of the torque."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.estimation.arm_regression import ArmSignals
+from servoscope.models.arm.model import ArmModel
+
+EVENT_WINDOW_S = 0.5  # over which the torque is averaged
+EVENT_MARGIN = 2.0  # times the largest of healthy recordings
+MIN_EVENT_LIMIT = 8.0  # times the noise
+MIN_EVENT_SHARE = 0.2  # share of the rms torque of a joint
+BREAKAWAY = 1.5  # times Coulomb friction that may hold a joint at rest
+MAX_EVENT_S = 8.0  # what lasts longer is a change
+MAX_EVENT_SHARE = 0.5  # share of the recording's time that events may take
+EVENT_PAUSE_S = 1.0  # shorter pauses belong to an event
+
+
+class ArmEvent(NamedTuple):
+    """A torque from outside: when [s], and the joints in which it was seen, the largest first."""
+
+    from_s: float
+    to_s: float
+    joints: tuple[str, ...]
+    torque: float  # largest of the first joint [N m]
+
+
+def outside_torque(
+    signals: ArmSignals, design: FloatArray, residual: FloatArray, model: ArmModel, theta: FloatArray
+) -> FloatArray:
+    """Return what friction cannot explain of the residual's average over half a second, (n, M)."""
+    from scipy.ndimage import uniform_filter1d
+
+    # all that the friction of a joint may be; at rest it has any sign
+    p, n = len(model.base.names), model.arm.size
+    loads = len(model.names)
+    held = []
+    for j in range(n):
+        coulomb = theta[p + 3 * j + 1]
+        by_load = np.abs(
+            design[j, loads + j] / np.where(design[j, p + 3 * j + 1] == 0.0, np.inf, design[j, p + 3 * j + 1])
+        )
+        held.append(BREAKAWAY * (abs(coulomb) + abs(theta[loads + j]) * by_load))
+    period = float(np.median(np.diff(signals.t)))
+    allowed = np.where(signals.moving, 0.0, np.array(held))
+    mean = uniform_filter1d(residual, max(1, round(EVENT_WINDOW_S / period)), axis=1)
+    return np.asarray(np.sign(mean) * np.maximum(np.abs(mean) - allowed, 0.0))
+
+
+def largest_events(
+    signals: ArmSignals,
+    design: FloatArray,
+    residual: FloatArray,
+    noise: FloatArray,
+    model: ArmModel,
+    theta: FloatArray,
+) -> FloatArray:
+    """Return the largest torque from outside of each joint, in units of the noise, (n,)."""
+    return np.asarray(np.abs(outside_torque(signals, design, residual, model, theta)).max(1) / noise)
+
+
+def find_events(t: FloatArray, outside: FloatArray, limits: FloatArray, names: tuple[str, ...]) -> list[ArmEvent]:
+    """Return the events of a recording; none where what exceeds the limits lasts, so that it is a change.
+
+    `t`: (M,) [s]; `outside`: `outside_torque` (n, M); `limits`: (n,).
+    """
+    over = np.abs(outside) > limits[:, None]
+    rows = np.flatnonzero(over.any(0))
+    if not rows.size:
+        return []
+    events = []
+    for span in np.split(rows, np.flatnonzero(np.diff(t[rows]) > EVENT_PAUSE_S) + 1):
+        torque = np.abs(outside[:, span[0] : span[-1] + 1]).max(1)
+        order = np.argsort(-torque / limits)
+        joints = tuple(names[j] for j in order if torque[j] > limits[j])
+        events.append(ArmEvent(float(t[span[0]]), float(t[span[-1]]), joints, float(torque[order[0]])))
+    took = sum(event.to_s - event.from_s for event in events)
+    short = max(event.to_s - event.from_s for event in events) <= MAX_EVENT_S
+    return events if short and took <= MAX_EVENT_SHARE * (t[-1] - t[0]) else []
+
+
+def outside_events(t: FloatArray, events: list[ArmEvent]) -> BoolArray:
+    """Return which rows (M,) no event touches."""
+    clear = np.ones(t.size, dtype=np.bool_)
+    for event in events:
+        clear &= (t < event.from_s - EVENT_WINDOW_S) | (t > event.to_s + EVENT_WINDOW_S)
+    return clear

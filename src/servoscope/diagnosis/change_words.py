@@ -1,0 +1,53 @@
+"""The change of a fault in one clause: what has risen or fallen, and by how much, for the first line of every view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from servoscope.core.messages import Message, catalogue, message
+from servoscope.isolation.candidate import FaultEstimate
+
+FRACTIONS = {0.1: "tenth", 0.2: "fifth", 0.25: "quarter", 1.0 / 3.0: "third", 0.5: "half"}
+MAX_FRACTION_ERROR = 0.05  # of a change that is called by a fraction, relative to the fraction
+MIN_FACTOR = 2.5  # ratio from which a change is a multiple of the healthy value, not a percentage more than it
+
+
+def change_messages(faults: Sequence[FaultEstimate]) -> tuple[Message, ...]:
+    """Return a clause for each fault: ``leakage has risen by a fifth``.
+
+    A size whose 95 % interval holds 1 has no direction: the clause says that it is not known.
+    """
+    return tuple(map(_change_message, faults))
+
+
+def fault_label(name: str) -> str:
+    """Return the name of a fault as every view shows it."""
+    return name.replace("_", " ")
+
+
+def quantity_name(fault: FaultEstimate) -> Message | str:
+    """Return the quantity that rises or falls with a fault."""
+    if f"quantity.{fault.name}" in catalogue():
+        return message(f"quantity.{fault.name}")
+    if fault.name == fault.parameter:
+        return fault_label(fault.name)
+    return message("quantity.other", name=fault_label(fault.name), parameter=fault.parameter)
+
+
+def _change_message(fault: FaultEstimate) -> Message:
+    name, (low, high) = quantity_name(fault), fault.interval
+    if fault.mass_kg is not None and not fault.mass_kg[1] <= 0.0 <= fault.mass_kg[2]:
+        return message("change.mass", name=name, mass=fault.mass_kg[0])
+    if low <= 1.0 <= high:
+        return message("change.unsure", name=name)
+    if fault.ratio >= MIN_FACTOR:
+        return message("change.multiple", name=name, ratio=fault.ratio)
+    key = "change.risen" if fault.ratio > 1.0 else "change.fallen"
+    return message(key, name=name, amount=_amount(abs(fault.ratio - 1.0)))
+
+
+def _amount(change: float) -> Message:
+    fraction = min(FRACTIONS, key=lambda value: abs(change / value - 1.0))
+    if abs(change / fraction - 1.0) <= MAX_FRACTION_ERROR:
+        return message(f"fraction.{FRACTIONS[fraction]}")
+    return message("fraction.percent", percent=100.0 * change)

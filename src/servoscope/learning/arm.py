@@ -1,0 +1,296 @@
+"""Learns from healthy logs of an arm: coefficients, what is left, how recordings scatter, and the limit of a change."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from servoscope.baseline.arm import (
+    ArmBaseline,
+    arm_causes,
+    coefficient_names,
+    complete_columns,
+    deviation_columns,
+    deviation_scales,
+)
+from servoscope.baseline.records import BaselineSource
+from servoscope.core.arrays import FloatArray, to_tuples
+from servoscope.core.blas import with_one_blas_thread
+from servoscope.core.errors import NotEnoughError, RecordingError
+from servoscope.core.messages import Message, message
+from servoscope.detection.arm_events import EVENT_MARGIN, MIN_EVENT_LIMIT, MIN_EVENT_SHARE, largest_events
+from servoscope.detection.arm_evidence import (
+    BETWEEN_SHARE,
+    DRIFT_SHARE,
+    ChangeTest,
+    random_effect,
+    second_half,
+)
+from servoscope.estimation.arm_regression import (
+    MIN_MOVING_S,
+    ArmSignals,
+    block_information,
+    filter_arm_log,
+)
+from servoscope.models.arm.model import FRICTION, ArmModel
+from servoscope.models.arm.settings import ArmLoop
+from servoscope.signals.readers.arm_log import ArmRecording
+
+FIT_STEPS = 3  # of least squares, each weighted by what the one before left of each joint's torque
+INFLATION_BLOCK_S = 2.0  # longer than the residual is correlated
+MAX_FRICTION_STD = 0.3  # share of a friction torque from which the motion does not determine it
+MAX_REVERSED = -3.0  # standard deviations below 0, from which friction says that a sign is wrong
+MOUNTING_RATIO = 2.0  # by which another mounting has to explain more before the given one is doubted
+MAX_COEFFICIENT = 1e3  # standard deviation of friction and offset a priori [N m, N m s]: nothing is known
+MAX_LOAD_FRICTION = 0.05  # the same of friction by load [N m per N m], of which little is known where the load is small
+NO_LOAD_FRICTION = 1e-6  # the same where the loop file leaves it out
+MIN_RECORDINGS = 3  # from which recordings are judged by the others
+
+
+class _Fit(NamedTuple):
+    """Weighted least squares: coefficients (P,), noise (n,), and each recording's information and vector."""
+
+    theta: FloatArray
+    noise: FloatArray
+    A: FloatArray  # (recordings, P, P)
+    b: FloatArray  # (recordings, P)
+    prior: FloatArray  # (P, P)
+
+
+@with_one_blas_thread
+def learn_arm(loop: ArmLoop, urdf: str, recordings: Sequence[ArmRecording]) -> ArmBaseline:
+    """Learn from healthy recordings; `urdf`: the text of the URDF.
+
+    Raises NotEnoughError if a joint hardly moves in them, RecordingError if a sign is reversed.
+    """
+    model = ArmModel(loop.kinematics(urdf, loop.urdf), loop)
+    signals = [filter_arm_log(recording, model) for recording in recordings]
+    _check_motion(model, signals)
+    temperature = np.mean([each.temperature.mean(0) for each in signals], axis=0)
+    p = len(model.base.names)
+    theta = np.zeros(len(coefficient_names(model)))
+    theta[:p] = model.base.nominal
+    for _ in range(2):  # friction by load needs the load, which the first fit gives
+        designs = [complete_columns(model, each, theta, temperature) for each in signals]
+        fit = _fit(model, signals, designs)
+        theta = fit.theta
+    information = fit.A.sum(0) + fit.prior
+    std = np.sqrt(np.diag(np.linalg.inv(information)))
+    _check_signs(model, theta, std, recordings[0].name)
+
+    torque = np.sqrt(np.mean([np.square(each.tau).mean(1) for each in signals], axis=0))
+    scale = deviation_scales(model, theta, torque)
+    # each recording by the coefficients of the others
+    several = len(signals) >= MIN_RECORDINGS
+    thetas = [
+        np.linalg.solve(information - fit.A[i], fit.b.sum(0) + fit.prior @ _start(model) - fit.b[i])
+        if several
+        else theta
+        for i in range(len(signals))
+    ]
+    residuals = [
+        each.tau - np.einsum("jpm,p->jm", X, own) for each, X, own in zip(signals, designs, thetas, strict=True)
+    ]
+    columns = [
+        np.concatenate([X, deviation_columns(model, each, X, theta)], axis=1)
+        for each, X in zip(signals, designs, strict=True)
+    ]
+    inflation = _inflation(signals, columns, residuals, fit.noise, len(theta))
+    weight = fit.noise * np.sqrt(inflation)
+    whole = [
+        block_information(each.t, *weighted(each, X, e, weight))
+        for each, X, e in zip(signals, columns, residuals, strict=True)
+    ]
+    moves = slice(len(theta), None)
+    found = [(each.A.sum(0)[moves, moves], each.g.sum(0)[moves]) for each in whole]
+    between = random_effect(found, scale, BETWEEN_SHARE)
+    halves = [second_half(each.part(moves), np.diag(between**-2.0)) for each in whole]
+    drift = random_effect(halves, scale, DRIFT_SHARE)
+    information /= np.median(inflation)
+    notes = list(_mounting_notes(model, signals, designs, fit, recordings[0].name))
+    limits = []
+    for i, one in enumerate(whole):
+        others = random_effect(found[:i] + found[i + 1 :], scale, BETWEEN_SHARE) if several else between
+        prior = np.zeros((len(theta) + scale.size,) * 2)
+        prior[: len(theta), : len(theta)] = information - several * fit.A[i] / np.median(inflation)
+        prior[moves, moves] = np.diag(others**-2.0)
+        test = ChangeTest(one, prior, arm_causes(model), scale, drift)
+        if i == len(whole) // 2:
+            limits.append(test.healthy_limit(loop.false_alarms))
+        if several:
+            evidence = test.weigh()
+            limits.append(evidence.log_factor)
+            if evidence.log_factor > -float(np.log(loop.false_alarms)):
+                cause = evidence.causes[0].cause
+                text = {
+                    "kind": cause.kind,
+                    "joint": message("arm.of_joint", joint=cause.joint) if cause.joint else None,
+                }
+                notes.append(message("arm.odd_recording", name=recordings[i].name, **text))
+    if not several:
+        notes.append(message("arm.few_recordings", least=MIN_RECORDINGS))
+    events = np.max(
+        [
+            largest_events(each, X, e, fit.noise, model, theta)
+            for each, X, e in zip(signals, designs, residuals, strict=True)
+        ],
+        axis=0,
+    )
+    return ArmBaseline(
+        loop=loop.model_dump(mode="json", exclude_defaults=True) | {"kind": "arm"},
+        urdf=urdf,
+        sources=tuple(
+            BaselineSource(name=each.name, samples=each.rows, duration_s=each.duration_s) for each in recordings
+        ),
+        names=coefficient_names(model),
+        theta=to_tuples(theta),
+        information=to_tuples(information),
+        temperature=to_tuples(temperature),
+        noise=to_tuples(fit.noise),
+        inflation=to_tuples(inflation),
+        scale=to_tuples(scale),
+        between=to_tuples(between),
+        drift=to_tuples(drift),
+        torque=to_tuples(torque),
+        event_limits=to_tuples(
+            np.maximum(np.maximum(EVENT_MARGIN * events, MIN_EVENT_LIMIT), MIN_EVENT_SHARE * torque / fit.noise)
+        ),
+        limit=max(0.0, *limits),
+        undetermined=tuple(_undetermined(model, theta, std * np.sqrt(np.median(inflation)))),
+        notes=tuple(notes),
+    )
+
+
+def weighted(
+    signals: ArmSignals, columns: FloatArray, residual: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return columns (n, D, M) and residual (n, M) over a standard deviation (n,), 0 where a joint rests."""
+    w = signals.moving / weight[:, None]
+    return columns * w[:, None], residual * w
+
+
+def _start(model: ArmModel) -> FloatArray:
+    """Return the coefficients (P,) before anything was measured: those of the URDF."""
+    start = np.zeros(len(coefficient_names(model)))
+    start[: len(model.base.names)] = model.base.nominal
+    return start
+
+
+def _fit(model: ArmModel, signals: Sequence[ArmSignals], designs: Sequence[FloatArray]) -> _Fit:
+    start = _start(model)
+    prior = np.zeros((start.size, start.size))
+    size = model.base.size
+    prior[range(size.size), range(size.size)] = size**-2.0
+    rest = np.arange(size.size, start.size)
+    prior[rest, rest] = MAX_COEFFICIENT**-2.0
+    load = len(model.names) + np.arange(model.arm.size)
+    prior[load, load] = (MAX_LOAD_FRICTION if model.loop.load_friction else NO_LOAD_FRICTION) ** -2.0
+    moving = np.concatenate([each.moving for each in signals], axis=1)
+    tau = np.concatenate([each.tau for each in signals], axis=1)
+    noise = np.sqrt((np.square(tau) * moving).sum(1) / moving.sum(1))
+    for _ in range(FIT_STEPS):
+        pieces = [
+            block_information(each.t, *weighted(each, X, each.tau, noise), np.inf)
+            for each, X in zip(signals, designs, strict=True)
+        ]
+        A, b = np.array([each.A[0] for each in pieces]), np.array([each.g[0] for each in pieces])
+        theta = np.linalg.solve(A.sum(0) + prior, b.sum(0) + prior @ start)
+        left = tau - np.concatenate([np.einsum("jpm,p->jm", X, theta) for X in designs], axis=1)
+        noise = np.sqrt((np.square(left) * moving).sum(1) / moving.sum(1))
+    return _Fit(theta, noise, A, b, prior)
+
+
+def _check_motion(model: ArmModel, signals: Sequence[ArmSignals]) -> None:
+    period = float(np.median(np.diff(signals[0].t)))
+    moved = np.sum([each.moving.sum(1) for each in signals], axis=0) * period
+    for name, seconds in zip(model.arm.names, moved, strict=True):
+        if seconds < MIN_MOVING_S:
+            raise NotEnoughError(
+                f"{name}: moves for {seconds:.1f} s in all recordings, at least {MIN_MOVING_S:g} s are needed:"
+                " add a log in which it moves, or lower rest_speed"
+            )
+
+
+def _check_signs(model: ArmModel, theta: FloatArray, std: FloatArray, name: str) -> None:
+    """Refuse friction that drives: the sign of a torque or of a gear is wrong."""
+    names = coefficient_names(model)
+    friction = {}
+    for joint in model.arm.names:
+        viscous, coulomb = (names.index(f"{joint}.{what}") for what in FRICTION[:2])
+        friction[joint] = (theta[viscous] / std[viscous], theta[coulomb] / std[coulomb])
+    worst = min(friction, key=lambda joint: sum(friction[joint]))
+    if sum(friction[worst]) < 0.0 and min(friction[worst]) < MAX_REVERSED:
+        raise RecordingError(
+            f"{name}: {worst}: its friction comes out negative, so position and torque have opposite signs: give it a"
+            " negative gain, or correct its gear or its axis in the URDF"
+        )
+
+
+def _inflation(
+    signals: Sequence[ArmSignals],
+    columns: Sequence[FloatArray],
+    residuals: Sequence[FloatArray],
+    noise: FloatArray,
+    first: int,
+) -> FloatArray:
+    """Return by how much the variance of sums over blocks exceeds that of independent samples, (n,).
+
+    The mean eigenvalue of the block sums' covariance in the metric of the information, over the joint's directions.
+    """
+    inflation = np.ones(noise.size)
+    for j in range(noise.size):
+        A: FloatArray | float = 0.0
+        G: FloatArray | float = 0.0
+        for each, X, e in zip(signals, columns, residuals, strict=True):
+            Xw, ew = weighted(each, X[:, first:], e, noise)
+            blocks = block_information(each.t, Xw[j : j + 1], ew[j : j + 1], INFLATION_BLOCK_S)
+            A, G = A + blocks.A.sum(0), G + blocks.g.T @ blocks.g
+        values, vectors = np.linalg.eigh(np.asarray(A) / (size := np.sqrt(np.diag(A)) + 1e-300) / size[:, None])
+        kept = values > 1e-6 * values[-1]
+        basis = vectors[:, kept] / np.sqrt(values[kept]) / size[:, None]
+        inflation[j] = max(1.0, float(np.trace(basis.T @ np.asarray(G) @ basis)) / kept.sum())
+    return inflation
+
+
+def _undetermined(model: ArmModel, theta: FloatArray, std: FloatArray) -> list[str]:
+    """Return the friction terms that the motion leaves open; those of a joint together are what counts."""
+    names = coefficient_names(model)
+    found = []
+    for joint in model.arm.names:
+        viscous, coulomb = (names.index(f"{joint}.{what}") for what in ("viscous_friction", "coulomb_friction"))
+        found += [names[i] for i in (viscous, coulomb) if std[i] > MAX_FRICTION_STD * abs(theta[i])]
+    return found
+
+
+def _mounting_notes(
+    model: ArmModel, signals: Sequence[ArmSignals], designs: Sequence[FloatArray], fit: _Fit, name: str
+) -> list[Message]:
+    """Return a doubt about the mounting, where another direction of gravity explains the torques much better."""
+    g = np.array(model.loop.gravity)
+    size = float(np.linalg.norm(g))
+    if size == 0.0:
+        return []
+    n, p = model.arm.size, len(model.base.names)
+    left = {}
+    for direction in np.concatenate([[g / size], np.eye(3), -np.eye(3)]):
+        turned = ArmModel(model.arm, model.loop.model_copy(update={"gravity": tuple((size * direction).tolist())}))
+        # only the links' nominal parameters: with all free, any mounting explains much
+        total = np.zeros(n)
+        for each, X in zip(signals, designs, strict=True):
+            rigid = turned.inertial_torque(each.q, each.v, each.a, turned.base.nominal)
+            left_over = each.tau - rigid
+            own = np.concatenate([X[:, p:]], axis=1)
+            flat = own.transpose(0, 2, 1)
+            for j in range(n):
+                used = flat[j][:, np.abs(flat[j]).max(0) > 0.0]
+                scaled = np.column_stack([used, rigid[j]])
+                total[j] += float(np.square(left_over[j] - scaled @ np.linalg.lstsq(scaled, left_over[j])[0]).sum())
+        left[tuple(np.round(direction, 3).tolist())] = float(np.sum(total / fit.noise**2))
+    given = next(iter(left.values()))
+    best = min(left, key=lambda direction: left[direction])
+    if given <= MOUNTING_RATIO * left[best]:
+        return []
+    text = ", ".join(f"{x:.2f}" for x in size * np.array(best))
+    return [message("arm.mounting", name=name, gravity=text, ratio=given / left[best])]

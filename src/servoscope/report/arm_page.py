@@ -1,0 +1,99 @@
+"""The diagnosis of an arm as one self-contained page: the verdict, the arm with its joints, torques over time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from servoscope.baseline.arm import ArmBaseline
+from servoscope.core.messages import translate
+from servoscope.diagnosis.arm import ArmExamination
+from servoscope.diagnosis.result import Diagnosis
+from servoscope.models.arm.dynamics import joint_positions
+from servoscope.report.page import render_page, say, write_page
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LABELS = {"fault": "Fault", "healthy": "Healthy", "undetermined": "Undetermined"}
+
+
+def write_arm_page(path: str | Path, diagnosis: Diagnosis, examination: ArmExamination, baseline: ArmBaseline) -> None:
+    """Write the report on one recording of an arm; raises OutputError if the file cannot be written."""
+    write_page(path, render_arm_page(diagnosis, examination, baseline))
+
+
+def render_arm_page(diagnosis: Diagnosis, examination: ArmExamination, baseline: ArmBaseline) -> str:
+    """Return the page; it needs nothing from outside, no script and no network."""
+    from servoscope.report.plotting import render_svg  # late: matplotlib takes half a second to import
+
+    odds = joint_odds(diagnosis, baseline.model.arm.names)
+    figures = [
+        ("The arm and its joints", say("arm.page_joints"), plot_arm(examination, baseline, odds)),
+        ("Torque from outside or unexplained", say("arm.page_torque"), plot_torque(examination, baseline, diagnosis)),
+    ]
+    return render_page(
+        "arm.html",
+        title=f"{translate(LABELS[diagnosis.verdict])}: {diagnosis.recording}",
+        kind=diagnosis.verdict,
+        label=LABELS[diagnosis.verdict],
+        diagnosis=diagnosis,
+        name=baseline.loop.name,
+        figures=[(name, lead, render_svg(figure, f"a{i}")) for i, (name, lead, figure) in enumerate(figures)],
+        provenance={"baseline": baseline.hash, "recordings": ", ".join(each.name for each in baseline.sources)},
+    )
+
+
+def joint_odds(diagnosis: Diagnosis, names: tuple[str, ...]) -> list[float]:
+    """Return the probability that each joint has changed."""
+    return [
+        sum(each.probability for each in diagnosis.candidates if each.name.endswith(f" of {name}")) for name in names
+    ]
+
+
+def plot_arm(examination: ArmExamination, baseline: ArmBaseline, odds: list[float]) -> Figure:
+    """Draw the arm as in the middle of the recording, its joints filled by their probability of a change."""
+    from matplotlib.figure import Figure as NewFigure
+
+    from servoscope.report.plotting import COLOURS, plot_style
+
+    arm, q = baseline.model.arm, examination.signals.q
+    places = joint_positions(arm, q[len(q) // 2])
+    with plot_style():
+        figure = NewFigure(figsize=(7.0, 3.2), layout="constrained")
+        axes: Any = figure.add_subplot(projection="3d")
+        for j, place in enumerate(places):
+            start = places[arm.parents[j]] if arm.parents[j] >= 0 else np.zeros(3)
+            axes.plot(*np.column_stack([start, place]), color=COLOURS["muted"], linewidth=3.0)
+            fill = COLOURS["alarm"] if odds[j] >= 0.5 else COLOURS["care"] if odds[j] >= 0.05 else COLOURS["healthy"]
+            axes.plot(*place[:, None], "o", color=fill, markersize=7.0)
+            axes.text(*place, f"  {arm.names[j]}", fontsize=7.5)
+        axes.set_axis_off()
+        axes.set_aspect("equal")
+    return figure
+
+
+def plot_torque(examination: ArmExamination, baseline: ArmBaseline, diagnosis: Diagnosis) -> Figure:
+    """Draw what the healthy arm leaves of each joint's torque, with the limits of events and the onset."""
+    from matplotlib.figure import Figure as NewFigure
+
+    from servoscope.report.plotting import COLOURS, plot_style
+
+    names, t = baseline.model.arm.names, examination.signals.t
+    with plot_style():
+        figure = NewFigure(figsize=(7.0, 0.9 * len(names) + 0.5), layout="constrained")
+        panels: Any = figure.subplots(len(names), sharex=True, squeeze=False)[:, 0]
+        for j, axes in enumerate(panels):
+            limit = baseline.event_limits[j] * baseline.noise[j]
+            axes.plot(t, examination.outside[j], color=COLOURS["ink"], linewidth=0.8)
+            for level in (-limit, limit):
+                axes.axhline(level, color=COLOURS["muted"], linewidth=0.7, linestyle="--")
+            for event in examination.events:
+                axes.axvspan(event.from_s, event.to_s, color=COLOURS["care"], alpha=0.3, linewidth=0.0)
+            if diagnosis.onset_s is not None:
+                axes.axvline(diagnosis.onset_s[1], color=COLOURS["alarm"], linewidth=1.0)
+            axes.set_title(f"{names[j]} [N m]", loc="left", fontsize=7.5)
+        panels[-1].set_xlabel("t [s]")
+    return figure

@@ -1,0 +1,61 @@
+"""The figures of an assessment: the log, y over u, the cycle; imported late."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from servoscope.assessment import Assessment
+from servoscope.assessment.assess import AssessedSignals
+from servoscope.report.format_values import time_axis_unit
+from servoscope.report.plotting import COLOURS, envelope, plot_style
+
+WIDTH, ROW = 9.0, 1.9  # inches
+MAX_PERIODS = 12  # in the plot of y over u
+
+
+def plot_assessment(assessment: Assessment) -> Iterator[tuple[str, Figure]]:
+    """Yield the figures with their titles; none of an assessment read back from JSON."""
+    signals = assessment.signals
+    if signals is not None:
+        yield "Log", _plot_log(signals)
+        yield "y over u", _plot_orbit(assessment, signals)
+
+
+@plot_style()
+def _plot_log(signals: AssessedSignals) -> Figure:
+    figure = Figure(figsize=(WIDTH, 2.0 * ROW + 0.6), layout="constrained")
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    unit, factor = time_axis_unit(float(signals.t[-1] - signals.t[0]))
+    t = (signals.t - signals.t[0]) / factor
+    begins = np.zeros(t.size, np.bool_)
+    for axis, x, name, colour in (
+        (top, signals.r, "r", "healthy"),
+        (top, signals.y, "y", "measured"),
+        (bottom, signals.u, "u", "care"),
+    ):
+        if x is not None:
+            axis.plot(*envelope(t, x, begins), color=COLOURS[colour], linewidth=0.9, label=name)
+    for axis in (top, bottom):
+        axis.legend(loc="upper right")
+        axis.grid(visible=True, color=COLOURS["rule"], linewidth=0.6)
+        axis.margins(x=0.01)
+    bottom.set_xlabel(f"time [{unit}]")
+    return figure
+
+
+@plot_style()
+def _plot_orbit(assessment: Assessment, signals: AssessedSignals) -> Figure:
+    figure = Figure(figsize=(WIDTH / 2.0, WIDTH / 2.4), layout="constrained")
+    axis = figure.subplots()
+    step = float(signals.t[-1] - signals.t[0]) / (signals.t.size - 1)
+    shown = signals.t.size
+    if assessment.oscillates and assessment.period_s:
+        shown = min(shown, int(MAX_PERIODS * assessment.period_s / step) + 2)
+    rows = slice((signals.t.size - shown) // 2, (signals.t.size + shown) // 2, max(shown // 5000, 1))
+    axis.plot(signals.u[rows], signals.y[rows], color=COLOURS["measured"], linewidth=0.7)
+    axis.grid(visible=True, color=COLOURS["rule"], linewidth=0.6)
+    axis.set(xlabel="u", ylabel="y")
+    return figure

@@ -1,0 +1,165 @@
+"""One log to a verdict: causes that are plain, what cannot be judged, exports of many tags, and the command."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import servoscope as ss
+from servoscope.assessment.assess import VERDICTS, Assessment
+from servoscope.assessment.plant_loops import group_by_period, rank
+from servoscope.assessment.tags import find_loops
+from servoscope.cli import app
+from servoscope.core.messages import speak
+
+N = 1200
+T = np.arange(N) * 10.0
+
+
+def loop(seed: int, *, gain: float = 0.3, stick: float = 0.0) -> dict[str, np.ndarray]:
+    """A flow loop under PI control, with noise and a valve that sticks by `stick`."""
+    rng = np.random.default_rng(seed)
+    u, y, x, level, total = np.zeros(N), np.zeros(N), 0.0, 0.0, 0.0
+    load = 0.0
+    for k in range(N):
+        load = 0.95 * load + 0.05 * rng.standard_normal()
+        y[k] = level + 0.03 * rng.standard_normal()
+        total -= y[k] / 6.0
+        u[k] = gain * (total - y[k])
+        if abs(u[k] - x) > 0.75 * stick:
+            x = u[k] - np.sign(u[k] - x) * 0.25 * stick
+        level = 0.8 * level + 0.2 * (x + load)
+    return {"t": T, "r": np.full(N, 50.0), "u": 50.0 + u, "y": 50.0 + y}
+
+
+def test_constant_signals_are_a_frozen_sensor_and_manual_mode() -> None:
+    good = loop(1)
+    frozen = ss.assess({**good, "y": np.full(N, 50.0)})
+    assert (frozen.verdict, frozen.probability) == ("frozen sensor", 1.0)
+    manual = ss.assess({**good, "u": np.full(N, 40.0)})
+    assert (manual.verdict, manual.probability) == ("manual", 1.0)
+
+
+def test_a_sticking_valve_is_found_and_a_good_loop_is_not_called_so() -> None:
+    sticks = ss.assess(loop(2, stick=4.0))
+    assert sticks.probabilities["stiction"] + sticks.probabilities["backlash"] > 0.5
+    assert sticks.period_s is not None
+    good = ss.assess(loop(3))
+    assert good.probabilities["stiction"] < 0.5
+    assert sum(good.probabilities.values()) == pytest.approx(1.0)
+    assert good.verdict in VERDICTS
+
+
+def test_what_cannot_be_judged_says_why() -> None:
+    log = loop(4)
+    short = ss.assess({name: x[:50] for name, x in log.items()})
+    assert short.verdict == "cannot tell"
+    assert "at least 100" in str(short.reason)
+    holes = log["y"].copy()
+    holes[::2] = np.nan
+    assert "50 %" in str(ss.assess({**log, "y": holes}).reason)
+    with speak("de"):
+        assert "mindestens 100" in str(short.reason)
+
+
+def test_a_missing_reference_and_gaps_do_not_stop_it() -> None:
+    log = loop(5)
+    kept = np.r_[0:300, 302:900, 1000:N]
+    result = ss.assess({name: x[kept] for name, x in log.items() if name != "r"})
+    assert result.verdict in VERDICTS
+    assert result.signals is not None
+    assert result.signals.r is None
+    assert result.signals.t.size == 900  # the gap of two rows is filled, the one of a hundred cuts
+
+
+def test_a_million_rows_are_thinned() -> None:
+    rng = np.random.default_rng(6)
+    u = np.cumsum(rng.standard_normal(1_000_000)) * 0.01
+    result = ss.assess({"t": np.arange(1e6), "u": u, "y": u + rng.standard_normal(1_000_000)})
+    assert result.samples == 1_000_000
+    assert result.signals is not None
+    assert result.signals.t.size <= 200_000
+
+
+def test_tags_of_an_export_are_loops() -> None:
+    names = ["Date", "FIC101.PV", "FIC101.OP", "FIC101.SP", "LIC7_MV", "LIC7_PV", "TI9.PV", "PC3SV", "PC3MV", "PC3PV"]
+    found = find_loops(names)
+    assert list(found) == ["FIC101", "LIC7", "PC3"]
+    assert (found["FIC101"].time, found["FIC101"].reference, found["FIC101"].input) == (
+        "Date",
+        "FIC101.SP",
+        "FIC101.OP",
+    )
+    assert found["PC3"].output == "PC3PV"
+    assert list(find_loops(["t", "r", "u", "y"])) == [""]
+
+
+def made(name: str, period: float, share: float, **probabilities: float) -> Assessment:
+    return Assessment(
+        recording=name,
+        verdict="good",
+        probability=0.5,
+        probabilities=probabilities,
+        reason="",
+        advice="",
+        samples=100,
+        sample_rate_hz=1.0,
+        period_s=period,
+        regularity=2.0,
+        oscillation_share=share,
+    )
+
+
+def test_loops_with_one_period_are_grouped_with_the_likeliest_source_first() -> None:
+    source, victim = made("a", 100.0, 0.5, stiction=0.8, good=0.2), made("b", 103.0, 0.9, good=0.4)
+    other = made("c", 250.0, 0.5, good=0.1)
+    assert group_by_period([victim, other, source]) == [(source, victim)]
+    assert rank([victim, source, other]) == [other, source, victim]
+
+
+def test_the_command_ranks_an_export_and_writes_pages_and_a_work_list(tmp_path: Path) -> None:
+    sticks, good = loop(7, stick=4.0), loop(8)
+    names = {"r": "SP", "u": "OP", "y": "PV"}
+    columns = {"t": T}
+    for tag, log in (("FIC1", sticks), ("FIC2", good)):
+        columns |= {f"{tag}.{names[name]}": log[name] for name in "ruy"}
+    lines = [",".join(columns), *(",".join(f"{x:.6g}" for x in row) for row in zip(*columns.values(), strict=True))]
+    log = tmp_path / "export.csv"
+    log.write_text("\n".join(lines))
+    work, pages = tmp_path / "work.csv", tmp_path / "pages"
+    pages.mkdir()
+    run = CliRunner().invoke(app, ["assess", str(log), "--json", "--csv", str(work), "--report", str(pages)])
+    assert run.exit_code == 0, run.output
+    results = [json.loads(line) for line in run.stdout.splitlines()]
+    assert {result["recording"] for result in results} == {"export.csv[FIC1]", "export.csv[FIC2]"}
+    assert results[0]["recording"] == "export.csv[FIC1]"
+    with work.open(newline="") as file:
+        assert len(list(csv.reader(file))) == 3
+    page = next(pages.glob("*FIC1*.html")).read_text(encoding="utf-8")
+    assert "<svg" in page and "What to do" in page
+    shown = CliRunner().invoke(app, ["assess", str(log)])
+    assert "export.csv" in shown.output and "probability" in shown.output
+
+
+def test_errors_are_one_line(tmp_path: Path) -> None:
+    log = tmp_path / "x.csv"
+    log.write_text("t,a,b\n" + "\n".join(f"{i},1,2" for i in range(200)))
+    run = CliRunner().invoke(app, ["assess", str(log)])
+    assert run.exit_code == 1
+    assert "say where the signals stand" in run.stderr and len(run.stderr.strip().splitlines()) == 1
+    assert CliRunner().invoke(app, ["assess", str(log), "--travel", "5,1"]).exit_code == 2
+
+
+def test_process_loops_are_judged(shared_data: Path) -> None:
+    """Two logs of one flow loop whose valve is known to stick: the valve is found."""
+    folder = shared_data / "real" / "process_loops"
+    with (folder / "index.csv").open(encoding="utf-8") as index:
+        files = [row["file"] for row in csv.DictReader(index) if row["loop"] == "2111FIC46005"]
+    for name in files[:2]:
+        result = ss.assess(folder / name)
+        assert result.probabilities["stiction"] + result.probabilities["backlash"] > 0.3, name

@@ -1,0 +1,197 @@
+"""Diagnoses of arms: a simulated one whose loop reacts to what changes, and measured ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner
+
+from servoscope.baseline.arm import ArmBaseline
+from servoscope.baseline.baseline import Baseline
+from servoscope.cli import app
+from servoscope.core.errors import BaselineError, NotEnoughError, RecordingError
+from servoscope.diagnosis.arm import diagnose_arm, examine_arm
+from servoscope.learning.arm import learn_arm
+from servoscope.models.arm.settings import ArmLoop
+from servoscope.models.arm.urdf import parse_urdf
+from servoscope.report.arm_page import render_arm_page
+from servoscope.signals.readers.arm_log import ArmRecording, read_arm_log
+from servoscope.simulation.arm import GAINS, SIGN_SPEED, URDF, ArmChange, simulate_arm, simulated_arm
+
+UR_GAINS = (14.87, 13.26, 11.13, 10.62, 11.03, 11.47)
+UR_DAYS = ("20_02_05", "20_02_06", "20_02_10")
+UR_HELD_OUT = (
+    "identification_data__ur-19_12_23_free",
+    "validation_data__ur-20_01_17-ptp_10_points",
+    "jointwise_motion__ur-20_01_22-joint_3",
+    "identification_data__ur-20_02_12-40sec_12harm",
+    "identification_data__ur-20_02_12-50sec_12harm",
+    "identification_data__ur-20_02_19_14harm50sec",
+    "identification_data__ur-20_02_19_15harm50sec",
+)
+
+pytestmark = pytest.mark.slow  # each simulates or reads minutes of six joints
+
+Read = Callable[[int, ArmChange | None], ArmRecording]
+
+
+@pytest.fixture(scope="module")
+def simulated() -> tuple[ArmBaseline, Read]:
+    arm, urdf = simulated_arm(), URDF.read_text(encoding="utf-8")
+    joints = {
+        name: {"position": f"q{j + 1}", "torque": f"i{j + 1}", "gain": GAINS[j]} for j, name in enumerate(arm.names)
+    }
+    table = {"kind": "arm", "urdf": "x", "sample_rate": 100.0, "sign_speed": SIGN_SPEED, "joints": joints}
+    loop = ArmLoop.from_dict(table, "arm.toml")
+
+    def record(seed: int, change: ArmChange | None = None) -> ArmRecording:
+        return read_arm_log(simulate_arm(seed, 30.0, change), loop, arm)
+
+    return learn_arm(loop, urdf, [record(seed) for seed in range(3)]), record
+
+
+def test_a_simulated_arm(simulated: tuple[ArmBaseline, Read], tmp_path: Path) -> None:
+    baseline, record = simulated
+    assert diagnose_arm(baseline, record(20, None)).verdict == "healthy"
+    diagnosis, examination = examine_arm(baseline, record(21, ArmChange("friction", 1.5, 3, 15.0)))
+    (fault,) = diagnosis.faults
+    assert (fault.name, fault.parameter) == ("friction", "elbow.coulomb_friction")
+    assert fault.ratio == pytest.approx(1.5, abs=0.15)
+    assert diagnosis.onset_s is not None and diagnosis.onset_s[1] == pytest.approx(15.0, abs=1.5)
+    page = render_arm_page(diagnosis, examination, baseline)
+    assert "friction of elbow" in page and page.count("<h2>The arm and its joints</h2>") == 1
+    loaded = diagnose_arm(baseline, record(22, ArmChange("payload", 2.0, 6, 15.0)))
+    assert loaded.verdict == "healthy" and loaded.faults[0].mass_kg is not None
+    assert loaded.faults[0].mass_kg[0] == pytest.approx(2.0, abs=0.3)
+    baseline.save(tmp_path / "arm.json")
+    assert ArmBaseline.load(tmp_path / "arm.json") == baseline
+    with pytest.raises(BaselineError, match="baseline of an arm"):
+        Baseline.load(tmp_path / "arm.json")
+
+
+def test_a_push_is_an_event(simulated: tuple[ArmBaseline, Read]) -> None:
+    baseline, record = simulated
+    recording = record(23, None)
+    torque = recording.torque.copy()
+    torque[1500:1550, 1] += 60.0
+    diagnosis = diagnose_arm(baseline, replace(recording, torque=torque))
+    assert diagnosis.verdict == "healthy" and "push or collision" in diagnosis.summary
+    (event,) = [each for each in diagnosis.warnings if each.kind == "event"]
+    assert event.from_s == pytest.approx(15.0, abs=0.5) and "shoulder" in event.message
+
+
+def test_an_arm_at_rest_is_undetermined(simulated: tuple[ArmBaseline, Read]) -> None:
+    baseline, record = simulated
+    recording = record(23, None)
+    still = replace(recording, q=np.broadcast_to(recording.q[:1], recording.q.shape))
+    still = replace(still, torque=np.broadcast_to(recording.torque[:1], recording.torque.shape))
+    assert diagnose_arm(baseline, still).verdict == "undetermined"
+    with pytest.raises(NotEnoughError, match=r"base_yaw: moves for 0\.0 s"):
+        learn_arm(baseline.loop, baseline.urdf, [still])
+
+
+def test_a_reversed_torque_is_refused(simulated: tuple[ArmBaseline, Read]) -> None:
+    baseline, record = simulated
+    recording = record(23, None)
+    reversed_sign = recording.torque * np.array([1, 1, -1, 1, 1, 1])
+    with pytest.raises(RecordingError, match="its friction comes out negative"):
+        learn_arm(baseline.loop, baseline.urdf, [replace(recording, torque=reversed_sign)])
+
+
+@pytest.fixture(scope="module")
+def ur10e(shared_data: Path) -> tuple[ArmBaseline, Callable[[str], ArmRecording]]:
+    folder = shared_data / "real" / "ur10e"
+    urdf = (folder / "ur10e.urdf").read_text(encoding="utf-8")
+    arm = parse_urdf(urdf, "ur10e.urdf")
+    joints = {
+        name: {"position": f"q{j + 1}", "torque": f"i{j + 1}", "gain": UR_GAINS[j]} for j, name in enumerate(arm.names)
+    }
+    loop = ArmLoop.from_dict({"kind": "arm", "urdf": "x", "sample_rate": 100.0, "joints": joints}, "arm.toml")
+
+    def record(name: str) -> ArmRecording:
+        return read_arm_log(folder / f"{name}.parquet", loop, arm)
+
+    days = sorted(path.stem for path in folder.glob("*.parquet") if any(day in path.stem for day in UR_DAYS))
+    return learn_arm(loop, urdf, [record(name) for name in days]), record
+
+
+def test_healthy_recordings_of_other_days(ur10e: tuple[ArmBaseline, Callable[[str], ArmRecording]]) -> None:
+    baseline, record = ur10e
+    verdicts = {name: diagnose_arm(baseline, record(name)) for name in UR_HELD_OUT}
+    assert {name: each.summary for name, each in verdicts.items() if each.verdict != "healthy" or each.intervals} == {}
+
+
+def test_a_payload_and_a_push(ur10e: tuple[ArmBaseline, Callable[[str], ArmRecording]]) -> None:
+    baseline, record = ur10e
+    for name in ("14harm50secLoad", "15harm50secLoad"):
+        diagnosis = diagnose_arm(baseline, record(f"identification_data__ur-20_02_19_{name}"))
+        assert diagnosis.verdict == "healthy" and "the payload changed" in diagnosis.summary
+        (fault,) = diagnosis.faults
+        assert fault.mass_kg is not None and fault.mass_kg[1] < 2.805 < fault.mass_kg[2]
+        assert fault.mass_kg[0] == pytest.approx(2.805, rel=0.1)
+    pushed = diagnose_arm(baseline, record("collision__ur-20_01_22-push_pose_1"))
+    assert pushed.verdict == "undetermined" and "It was pushed" in pushed.summary
+
+
+def test_friction_is_found_in_its_joint(ur10e: tuple[ArmBaseline, Callable[[str], ArmRecording]]) -> None:
+    """Coulomb friction of each joint grows by 30 % in the middle of a recording of another day."""
+    from scipy.signal import butter, sosfiltfilt
+
+    baseline, record = ur10e
+    recording = record("identification_data__ur-20_02_12-50sec_12harm")
+    smooth = sosfiltfilt(butter(3, 10.0, fs=100.0, output="sos"), recording.q, axis=0)
+    v, late = np.gradient(smooth, 0.01, axis=0), np.arange(len(smooth)) >= len(smooth) // 2
+    for j, name in enumerate(baseline.model.arm.names):
+        torque = recording.torque.copy()
+        torque[:, j] += 0.3 * baseline.coefficient(f"{name}.coulomb_friction")[0] * np.tanh(v[:, j] / 0.01) * late
+        diagnosis = diagnose_arm(baseline, replace(recording, torque=torque))
+        (fault,) = diagnosis.faults
+        assert fault.parameter.startswith(f"{name}.") and fault.name == "friction"
+        assert fault.interval[0] < 1.3 < fault.interval[1]
+
+
+def test_the_published_friction_of_a_tx40(shared_data: Path) -> None:
+    """TX40_config.yaml of figaroh-examples: fv and fs; what the wrist's motor adds to both its joints counts."""
+    folder = shared_data / "real" / "tx40"
+    urdf = (folder / "tx40_mdh_modified.urdf").read_text(encoding="utf-8")
+    arm = parse_urdf(urdf, "tx40.urdf")
+    gears = np.diag([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])
+    gears[5, 4] = 32.0
+    offsets = (0.0, -np.pi / 2, np.pi / 2, 0.0, 0.0, 0.0)
+    joints = {
+        name: {"position": f"q{j + 1}_raw", "torque": f"current{j + 1}_raw", "offset": offsets[j]}
+        for j, name in enumerate(arm.names)
+    }
+    table = {"kind": "arm", "urdf": "x", "sample_rate": 1000.0, "cutoff": 30.0, "sign_speed": 0.02, "joints": joints}
+    loop = ArmLoop.from_dict({**table, "load_friction": False, "gears": gears.tolist()}, "arm.toml")
+    time = pq.read_schema(folder / "tx40.parquet").names[0]
+    loop = loop.model_copy(update={"time": time})
+    baseline = learn_arm(loop, urdf, [read_arm_log(folder / "tx40.parquet", loop, arm)])
+
+    def friction(what: str) -> np.ndarray:
+        return np.array([baseline.coefficient(f"{name}.{what}_friction")[0] for name in arm.names])
+
+    viscous = friction("viscous") + baseline.coefficient("motor1.viscous_friction")[0] * np.array([0, 0, 0, 0, 1, 1])
+    assert np.abs(viscous / [8.05, 5.53, 1.97, 1.11, 1.86, 0.65] - 1.0)[:5].max() < 0.015
+    assert np.abs(friction("coulomb") / [7.14, 8.26, 6.34, 2.48, 3.03, 0.282] - 1.0)[:5].max() < 0.02
+
+
+def test_the_commands_take_an_arm(tmp_path: Path) -> None:
+    from servoscope.simulation.arm import write_example
+
+    write_example(tmp_path)
+    days = [str(tmp_path / f"day{day}.csv") for day in (1, 2, 3)]
+    run = CliRunner().invoke
+    learned = run(app, ["learn", str(tmp_path / "arm.toml"), *days, "-o", str(tmp_path / "arm.json")])
+    assert learned.exit_code == 0 and "base_yaw" in learned.output
+    logs = [str(tmp_path / "tuesday.csv"), str(tmp_path / "pallet.csv")]
+    told = run(app, ["diagnose", str(tmp_path / "arm.json"), *logs, "--fail-on-fault"])
+    assert told.exit_code == 3, told.output
+    assert "friction of elbow" in told.output and "the payload changed" in told.output
+    refused = run(app, ["diagnose", str(tmp_path / "arm.json"), *logs, "--from", "3"])
+    assert refused.exit_code == 2 and "not for an arm" in refused.output

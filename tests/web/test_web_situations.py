@@ -1,0 +1,201 @@
+"""Situations as somebody meets them at night: what is it, since when, what do I do now, on the first screen."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import pytest
+import screens
+from opening import PATIENCE_MS, accessible
+from screens import asked, until
+
+from servoscope.core.messages import message
+from servoscope.diagnosis.explanation import build_headline
+from servoscope.diagnosis.result import Diagnosis, FaultInterval, RefitSummary
+from servoscope.isolation.candidate import Candidate, FaultEstimate
+from servoscope.service.assets.examination import StoredDiagnosis
+from servoscope.service.store import Store
+from servoscope.service.store.store import Batch
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is missing: make install brings it")
+
+pytestmark = pytest.mark.slow
+
+NOW = 1798000000.0  # 2026-12-23T04:26:40Z
+BEGAN = NOW - 600.0
+ONSET = BEGAN + 120.0
+AT = "2026-12-23 04:18"  # the onset on the reader's clock, which is UTC
+LEAK = FaultEstimate(name="leakage", parameter="C_ie", ratio=1.2, interval=(1.19, 1.21))
+WEAK = FaultEstimate(name="pump", parameter="p_s", ratio=0.9, interval=(0.898, 0.902))
+STICKY = FaultEstimate(name="friction", parameter="b_p", ratio=4.04, interval=(3.9, 4.2))
+UNSURE = FaultEstimate(name="leakage", parameter="C_ie", ratio=0.99, interval=(0.9, 1.08))
+SEAL, FILTER, BEARING = "piston seal and valve edges", "supply pressure and filter", "rod seal, guide and bearing"
+FIRST_SCREENS = ((1366, 768), (390, 844))
+
+
+def candidate(probability: float, *faults: FaultEstimate) -> Candidate:
+    return Candidate(name=" + ".join(f.name for f in faults) or "unknown", probability=probability, faults=faults)
+
+
+def refit(over_s: float = 0.0) -> RefitSummary:
+    recursive = (candidate(1.0, LEAK),)
+    return RefitSummary(
+        from_s=0.0, to_s=600.0, over_s=over_s, noise=1.0, misfit=9.0, limit=40.0, recursive=recursive, mimics=()
+    )
+
+
+def diagnosis(*candidates: Candidate, checks: tuple[str, ...], end_s: float | None = None, over_s: float = 0.0) -> Any:
+    """A full diagnosis of a window that began at `BEGAN`, as the service stores it."""
+    faults = candidates[0].faults if candidates[0].probability >= 0.95 else ()
+    end = (end_s - 1.0, end_s, end_s + 1.0) if end_s is not None else None
+    interval = FaultInterval(
+        detected_at_s=121.0,
+        onset_s=(119.0, 120.0, 121.0),
+        end_s=end_s,
+        end_interval_s=end,
+        probability=candidates[0].probability,
+        faults=faults,
+        candidates=candidates,
+        refit=refit(over_s) if faults else None,
+    )
+    headline = build_headline("fault", (interval,), {}, ())
+    said = Diagnosis(
+        recording="x", samples=60000, duration_s=600.0, verdict="fault", headline=headline,
+        checks=checks, intervals=(interval,), parameters={}, ifrf=(),
+    )  # fmt: skip
+    document = {"began": BEGAN, "signature": [], **said.model_dump(mode="json")}
+    dated = said.dated_headline(BEGAN)
+    return StoredDiagnosis(verdict="fault", headline=dated, onset=ONSET, document=document), faults
+
+
+class Situation(NamedTuple):
+    """What the store knows, and what the first screen has to say: what it is, since when, what to do."""
+
+    status: dict[str, Any]
+    full: Any
+    expected: tuple[str, str, str]
+
+
+def fault(*candidates: Candidate, what: str, do: str, checks: tuple[str, ...], over_s: float = 0.0) -> Situation:
+    full, faults = diagnosis(*candidates, checks=checks, over_s=over_s)
+    status = {"verdict": "fault", "summary": full.summary, "onset": ONSET, "diagnosed": NOW, "fault_at": NOW}
+    status |= {"faults": [one.model_dump(mode="json") for one in faults], "statistic": 2.0, "level": 0.5}
+    return Situation(status, full, (what, AT, do))
+
+
+GONE, _ = diagnosis(candidate(0.99, LEAK), checks=(SEAL,), end_s=300.0)
+SITUATIONS = {
+    "step": fault(candidate(0.99, LEAK), what="leakage has risen by a fifth", do=SEAL, checks=(SEAL,)),
+    "drift": fault(
+        candidate(0.98, STICKY), what="friction has risen to 4", do=BEARING, checks=(BEARING,), over_s=100.0
+    ),
+    "pair": fault(
+        candidate(0.97, WEAK, LEAK),
+        what="gain has fallen by a tenth and leakage has risen by a fifth",
+        do=FILTER,
+        checks=(FILTER, SEAL),
+    ),
+    "open": fault(
+        candidate(0.6, LEAK), candidate(0.4, WEAK), what="leakage (60 %) or pump (40 %)", do=SEAL, checks=(SEAL, FILTER)
+    ),
+    "unsure": fault(
+        candidate(0.97, UNSURE), what="leakage has changed by an amount that is not certain", do=SEAL, checks=(SEAL,)
+    ),
+    "unknown": fault(
+        candidate(0.99), what="no single known fault explains", do="changed last", checks=("what was changed last",)
+    ),
+    "gone": Situation(
+        {
+            "verdict": "healthy",
+            "summary": "Healthy.",
+            "alarms": {
+                "fault": {"state": "returned_unacknowledged", "since": NOW, "priority": "high", "cause": GONE.summary}
+            },
+        },
+        GONE,
+        ("not answered yet: Fault: leakage from", AT, SEAL),
+    ),
+    "fresh": Situation(
+        {
+            "verdict": "fault",
+            "summary": str(message("service.examination.fault")),
+            "onset": ONSET,
+            "statistic": 2.0,
+            "awaited": [3],
+        },
+        None,
+        ("the loop deviates from its healthy behaviour", AT, "full diagnosis is under way"),
+    ),
+    "healthy": Situation(
+        {"verdict": "healthy", "summary": "Healthy: no change found. ..."}, None, ("no change found", AT, "Nothing: ")
+    ),
+    "stuck": Situation(
+        {"verdict": "undetermined", "summary": "Undetermined.", "quality": {"frozen_y": ONSET}},
+        None,
+        ("Undetermined: y stays the same, sensor or axis is stuck", AT, "check sensor, cable"),
+    ),
+    "silent": Situation(
+        {"verdict": "undetermined", "summary": "Undetermined: no data come.", "reception": "silent"},
+        None,
+        ("Undetermined: no data come", AT, "check topic or nodes"),
+    ),
+}
+
+
+def stored(name: str, situation: Situation) -> dict[str, Any]:
+    status = {
+        "since": ONSET,
+        "onset": None,
+        "examined": NOW,
+        "ne107": "good",
+        "reasons": [],
+        "quality": {},
+        "alarms": {},
+    }
+    status |= {"t": NOW, "counted": {"began": BEGAN, "t": NOW, "rows": 1}, **situation.status}
+    status["about"] = {"faults": {"leakage": "internal leakage", "pump": "pump or valve gain"}, "source": "line"}
+    return {"asset": name, "sequence": 1, "state": b"", "status": status, "at": NOW}
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    folder = tmp_path_factory.mktemp("night")
+    store, batch = Store.open("history.sqlite", folder, write=True), Batch()
+    for name, situation in SITUATIONS.items():
+        batch.checkpoints[name] = stored(name, situation)
+        if situation.full is not None:
+            row = {"asset": name, "number": 1, "t": NOW, "grounds": "full", **situation.full.columns()}
+            batch.rows["diagnoses"].append(row)
+    store.write(batch, "hall", 1)
+    store.close()
+    base = f"http://127.0.0.1:{screens.free_port()}"
+    with screens.process("serve", "--store", "history.sqlite", "--listen", base.removeprefix("http://"), cwd=folder):
+        until(lambda: asked(base, "/session"))
+        yield base
+
+
+@pytest.fixture(scope="module")
+def page(chromium: Any) -> Iterator[Any]:
+    context = chromium.new_context(locale="en-GB", timezone_id="UTC")
+    opened = context.new_page()
+    opened.set_default_timeout(PATIENCE_MS)
+    yield opened
+    context.close()
+
+
+@pytest.mark.parametrize("name", SITUATIONS)
+def test_the_first_screen_says_what_since_when_and_what_to_do(page: Any, address: str, name: str) -> None:
+    what, since, todo = SITUATIONS[name].expected
+    for width, height in FIRST_SCREENS:
+        page.set_viewport_size({"width": width, "height": height})
+        page.goto(f"{address}/assets/{name}")
+        verdict = page.get_by_role("region", name="Verdict")
+        for words in (what, since, todo):
+            shown = verdict.get_by_text(words).first
+            playwright.expect(shown).to_be_visible()
+            box = shown.bounding_box()
+            assert box["y"] + box["height"] <= height, (words, width)
+        assert not re.search(r"T²|CUSUM|σ|iFRF|_friction", verdict.inner_text())
+    accessible(page)
