@@ -66,13 +66,18 @@ def test_what_may_be_a_covariate_is_mentioned(log: Path, tmp_path: Path) -> None
     path = tmp_path / "warm.csv"
     path.write_text("\n".join(rows), encoding="utf-8")
     told = run("init", path, "-o", tmp_path / "loop.toml")
-    assert told.code == 0 and "if Öltemperatur" in told.out and "covariates" in told.out
+    assert told.code == 0 and "Öltemperatur" in told.out and "a temperature, with which friction" in told.out
+    text = (tmp_path / "loop.toml").read_text(encoding="utf-8")
+    assert Loop.load(tmp_path / "loop.toml").columns.covariates == {}
+    (tmp_path / "loop.toml").write_text(text.replace("# covariates =", "covariates ="), encoding="utf-8")
+    assert Loop.load(tmp_path / "loop.toml").columns.covariates == {"öltemperatur": "`Öltemperatur [°C]`"}
 
 
 def test_rest_that_the_plant_does_not_explain_is_left_out(shared_data: Path, tmp_path: Path) -> None:
     target = tmp_path / "loop.toml"
     told = run("init", shared_data / "real" / "xl330" / "sin_sin_kp100.parquet", "-o", target)
-    assert told.code == 0 and "if input_volts, temp moves what is healthy" in " ".join(told.out.split())
+    out = " ".join(told.out.split())
+    assert told.code == 0 and "temp, " in out and "a temperature, with which" in out
     monitor = Loop.load(target).monitor
     assert monitor.update_when == "moving" and 0.0 < monitor.rest_speed < 0.1
 

@@ -32,10 +32,11 @@ from servoscope.signals.readers.guess_columns import (
     guess_mapping,
     mapping_template,
     names_speed,
+    names_target_torque,
     quoted_channel,
 )
 from servoscope.signals.readers.select import RowFilter
-from servoscope.signals.readers.table import number_column
+from servoscope.signals.readers.table import TableFile, number_column
 from servoscope.signals.readers.units import split_unit
 from servoscope.signals.readers.wrap import find_wrap
 
@@ -43,21 +44,13 @@ MEMORIES = 10.0  # that a recording to learn from should have at least
 MAX_MEMORY_S, MIN_PERIODS = 5.0, 5.0  # of the estimator; periods of the cutoff that it holds at least
 JITTER_PERCENT = 5.0  # of a sample: standard deviation of the steps above which rows are resampled
 SPEED_AXIS = {"kind": "axis", "y": "speed", "terms": ["viscous", "coulomb", "offset"]}
-# what moves the healthy coefficients, by what its name contains
-COVARIATE_STEMS = (
-    "temp",
-    "°c",
-    "degc",
-    "volt",
-    "supply",
-    "pressure",
-    "druck",
-    "pression",
-    "load",
-    "carga",
-    "humid",
-    "温度",
-)
+# what may move the healthy coefficients, by what its name contains
+COVARIATE_STEMS = {
+    "temperature": ("temp", "°c", "degc", "温度"),
+    "supply": ("volt", "supply", "pressure", "druck", "pression"),
+    "load": ("load", "carga", "humid"),
+}
+MIN_SLOW_SHARE = 0.5  # of the variance of a covariate, that lies between memories: what is faster follows the motion
 MAX_SPAN_RATIO = 8.0  # of r over y, or y over r, beyond which one of them is in another unit
 MIN_CLEAR_SHARE = 0.9  # share of u that a plant explains; below it, the choice is in doubt
 
@@ -197,16 +190,18 @@ def propose_loop(paths: Sequence[Path], columns: Columns, where: Mapping[str, st
             ProposalLine("monitor", "update_when", '"moving"', message("init.update_when")),
             ProposalLine("monitor", "rest_speed", repr(speed), message("init.rest_speed")),
         ]
+    further, told = _further_columns(path, columns, where, max(round(memory * rate), 1))
     lines = (
         ProposalLine("", "sample_rate", repr(rate), message("init.rate", samples=recording.samples)),
         *_column_lines(path, columns, wraps, recording),
+        *further,
         *_plant_lines(chosen),
         ProposalLine("monitor", "cutoff", repr(cutoff), message("init.cutoff")),
         ProposalLine("monitor", "memory", repr(memory), message("init.memory", length=recording.duration_s)),
         ProposalLine("monitor", "frequencies", repr(frequencies), message("init.frequencies")),
         *held,
     )
-    return LoopProposal(loop, lines, candidates, (*notes, *_covariate_notes(path, columns)), path.name)
+    return LoopProposal(loop, lines, candidates, (*notes, *told), path.name)
 
 
 def _inspect(recording: Recording, is_speed: bool) -> Inspection:
@@ -227,17 +222,48 @@ def _plant_lines(chosen: PlantCandidate) -> list[ProposalLine]:
     return lines
 
 
-def _covariate_notes(path: Path, columns: Columns) -> list[Message]:
-    """Return which other columns may move what is healthy, by their names."""
+def _further_columns(
+    path: Path, columns: Columns, where: Mapping[str, str] | None, memory: int
+) -> tuple[list[ProposalLine], list[Message]]:
+    """Return a line with covariates, and what else columns are, by their names and values.
+
+    `memory`: of the estimator [samples]; what changes within it follows the motion and is no covariate.
+    """
     mapped = " ".join([columns.reference, columns.input, *columns.outputs, columns.time or ""])
-    names = [
-        channel.name
-        for channel in list_channels(path, columns.text)
-        if any(stem in channel.name.casefold() for stem in COVARIATE_STEMS)
-        and channel.name not in mapped
-        and channel.min < channel.max
-    ]
-    return [message("init.covariates", names=names)] if names else []
+    opened = open_file(path, columns.text)
+    moving = [c.name for c in list_channels(path, columns.text) if c.name not in mapped and c.min < c.max]
+    notes = [message("init.target_torque", name=name) for name in moving if names_target_torque(name)]
+    kinds = {
+        name: kind
+        for kind, stems in COVARIATE_STEMS.items()
+        for name in moving
+        if any(stem in name.casefold() for stem in stems) and not names_target_torque(name)
+    }
+    slow = {}
+    for name, values in _column_values(opened, list(kinds), where).items():
+        x = values[np.isfinite(values)]
+        blocks = np.array_split(x, max(x.size // memory, 1))
+        if np.var([block.mean() for block in blocks]) >= MIN_SLOW_SHARE * np.var(x):
+            slow[re.sub(r"\W+", "_", split_unit(name)[0]).strip("_").lower() or kinds[name]] = name
+            low, high = float(x.min()), float(x.max())
+            notes.append(message("init.covariate", name=name, low=low, high=high, why=message(f"init.{kinds[name]}")))
+        else:
+            notes.append(message("init.moves", name=name))
+    if not slow:
+        return [], notes
+    value = ", ".join(f"{_quoted(key)} = {_quoted(quoted_channel(name))}" for key, name in slow.items())
+    return [ProposalLine("columns", "# covariates", f"{{{value}}}", message("init.covariates"))], notes
+
+
+def _column_values(opened: TableFile, names: Sequence[str], where: Mapping[str, str] | None) -> dict[str, FloatArray]:
+    """Return the chosen rows of some columns of a file."""
+    pieces: dict[str, list[FloatArray]] = {name: [] for name in names}
+    chosen = RowFilter(opened, where or {})
+    for table in opened.iter_chunks({*names, *chosen.columns}) if names else ():
+        rows = chosen.mask(table)
+        for name in names:
+            pieces[name].append(number_column(table, name, "init")[rows])
+    return {name: np.concatenate(values) for name, values in pieces.items()}
 
 
 def init(
@@ -292,17 +318,11 @@ def _unwrapped_columns(
             plain[key] = combination
     if len(columns.outputs) > 1:
         plain.pop("output", None)
-    wanted = [name for each in plain.values() for name in each.factors]
-    pieces: dict[str, list[FloatArray]] = {name: [] for name in wanted}
-    chosen = RowFilter(opened, where or {})
-    for table in opened.iter_chunks({*wanted, *chosen.columns}) if wanted else ():
-        rows = chosen.mask(table)
-        for name in wanted:
-            pieces[name].append(number_column(table, name, "init")[rows])
+    values = _column_values(opened, [name for each in plain.values() for name in each.factors], where)
     changes, wraps = {}, {}
     for key, each in plain.items():
         ((name, factor),) = each.factors.items()
-        if (period := find_wrap(np.concatenate(pieces[name]))) is not None:
+        if (period := find_wrap(values[name])) is not None:
             text = f"{quoted_channel(name)} % {period:.16g}"
             changes[key] = text if factor == 1.0 else f"{factor:.15g} * ({text})"
             wraps[key] = period
