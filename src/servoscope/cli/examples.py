@@ -11,6 +11,7 @@ EXAMPLES = {
     "learn": "servoscope learn loop.toml monday.csv tuesday.csv -o baseline.json",
     "diagnose": "servoscope diagnose baseline.json friday.csv --report friday.html",
     "verify": "servoscope verify friday.json friday.csv baseline.json",
+    "add": "servoscope add hall.toml press baseline.json --source line",
     "run": "servoscope run hall.toml",
     "watch": "servoscope watch hall.toml",
     "history": "servoscope history hall.toml --asset press",

@@ -34,6 +34,7 @@ export async function show(main, { signal, linked, values }) {
   const map = h("div", { class: "map" });
   const body = h("div", { role: "rowgroup", class: "rows" });
   const none = h("p", { class: "empty" }, "Loading");
+  const first = h("p", { class: "empty", hidden: true }, h("a", { href: "/begin" }, "Begin with a log"), ". ", "The log of a healthy machine becomes settings and a baseline. `servoscope add` writes the machine into a service file, and `servoscope run` follows it.");
   const counts = filters();
   const sources = overview((name) => ((filter.source = filter.source === name ? "" : name), chosen(), recount()));
   const search = h("input", { type: "search", placeholder: "Search", "aria-label": "Search assets", value: filter.search });
@@ -49,6 +50,7 @@ export async function show(main, { signal, linked, values }) {
     map,
     grid,
     none,
+    first,
   );
   grid.append(
     h("div", { role: "rowgroup" }, h("div", { role: "row", class: "line titles" }, COLUMNS.map((name, i) => h("span", { role: "columnheader", class: ((i > 4 && i < 10) || i === 12) && "n" }, name)))),
@@ -107,7 +109,8 @@ export async function show(main, { signal, linked, values }) {
   function sift() {
     const shown = [...assets.values()].filter(showIfWanted);
     none.hidden = shown.length > 0;
-    tell(none, assets.size ? "No asset is like this." : "No assets yet: `servoscope run` follows them, and writes what it finds to this store.");
+    first.hidden = assets.size > 0;
+    tell(none, assets.size ? "No asset is like this." : "No machine yet.");
   }
 
   function chosen() {
