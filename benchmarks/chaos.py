@@ -365,7 +365,9 @@ def main() -> None:
     command.add_argument("--speed", type=float, default=1.0, help="times true speed")
     command.add_argument("--block", type=float, default=1.0, help="length of a block, in s")
     command.add_argument("--every", type=float, default=20.0, help="mean time between disturbances, in s")
-    command.add_argument("--render", action="store_true", help="write the table into docs/reliability.md, and no more")
+    command.add_argument(
+        "--render", action="store_true", help="write the table into benchmarks/reliability/RESULTS.md, and no more"
+    )
     given = command.parse_args()
     if given.render:
         render()

@@ -1,4 +1,4 @@
-"""Let the service run through a day of 200 assets in minutes, disturb it, and write docs/reliability.md.
+"""Let the service run through a day of 200 assets in minutes, disturb it, and write benchmarks/reliability/RESULTS.md.
 
     python benchmarks/soak.py [sqlite|postgresql ...] [--hours 24] [--assets 200] [--speed 40] [--render]
     python benchmarks/soak.py --kills 200 [--json]
@@ -42,7 +42,7 @@ from servoscope.service import log  # noqa: E402
 from servoscope.service.metrics import BUCKETS_S  # noqa: E402
 
 RESULTS = BENCHMARKS / "reliability" / "results"
-PAGE = BENCHMARKS.parent / "docs" / "reliability.md"
+PAGE = BENCHMARKS / "reliability" / "RESULTS.md"
 TRIALS = ("sqlite", "postgresql")
 COMPARED = 10  # assets that are run once more without disturbance
 CALM = 0.25  # share of the run at the end that is left in peace
@@ -231,7 +231,9 @@ def main() -> None:
     command.add_argument("--assets", type=int, default=200, help="assets")
     command.add_argument("--speed", type=float, default=40.0, help="times true speed")
     command.add_argument("--every", type=float, default=EVERY_S, help="mean time between disturbances, in s")
-    command.add_argument("--render", action="store_true", help="write docs/reliability.md from the results")
+    command.add_argument(
+        "--render", action="store_true", help="write benchmarks/reliability/RESULTS.md from the results"
+    )
     command.add_argument("--kills", type=int, help="kill it so many times on each store instead")
     command.add_argument("--json", action="store_true", help="with --kills: print JSON")
     given = command.parse_args()

@@ -2,7 +2,7 @@
 
     python benchmarks/hostile/run.py [--inputs 900] [--only NAME] [--render]
 
---render writes the table into docs/reliability.md from the results that are there.
+--render writes the table into benchmarks/reliability/RESULTS.md from the results that are there.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from hostile.feeding import broken_bounds, feed_all, markdown  # noqa: E402
 from servoscope.core.files import atomic_write  # noqa: E402
 
 RESULTS = BENCHMARKS / "hostile" / "results.json"
-PAGE = BENCHMARKS.parent / "docs" / "reliability.md"
+PAGE = BENCHMARKS / "reliability" / "RESULTS.md"
 
 
 def render() -> None:
@@ -42,7 +42,9 @@ def main() -> None:
     command = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     command.add_argument("--inputs", type=int, default=900, help="for each")
     command.add_argument("--only", default="", help="those whose names contain this; nothing is kept then")
-    command.add_argument("--render", action="store_true", help="write the table into docs/reliability.md, and no more")
+    command.add_argument(
+        "--render", action="store_true", help="write the table into benchmarks/reliability/RESULTS.md, and no more"
+    )
     given = command.parse_args()
     if given.render:
         render()

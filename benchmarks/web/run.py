@@ -1,4 +1,4 @@
-"""Let many pages look at many assets, and write the table of docs/how-to/dashboard.md.
+"""Let many pages look at many assets, and write the table of benchmarks/STUDIES.md.
 
     python benchmarks/web/run.py [--assets 500] [--pages 4] [--readers 16] [--seconds 60] [--hour 3600] [--render]
 
@@ -37,7 +37,7 @@ from servoscope.core.files import atomic_write  # noqa: E402
 from web import store  # noqa: E402
 
 RESULTS = BENCHMARKS / "web" / "results.json"
-PAGE = BENCHMARKS.parent / "docs" / "how-to" / "dashboard.md"
+PAGE = BENCHMARKS / "STUDIES.md"
 SOURCES = str(BENCHMARKS.parent / "src")
 RATE = 2.0  # Hz: of the statuses in the store
 FULL = {"assets": 500, "pages": 4, "readers": 16, "seconds": 60.0, "hour": 3600.0}

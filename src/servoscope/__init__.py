@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 __all__ = [
     "Assessment",
@@ -35,6 +35,7 @@ __all__ = [
     "plot",
     "read",
     "read_parts",
+    "relearn",
     "simulate",
     "write_report",
 ]
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
     from servoscope.diagnosis.monitor import Monitor
     from servoscope.diagnosis.novelty import NoveltyDetector as NoveltyDetector
     from servoscope.diagnosis.operating_points import learn
+    from servoscope.diagnosis.relearn import relearn
     from servoscope.diagnosis.result import Diagnosis
     from servoscope.learning.inspection import inspect
     from servoscope.learning.proposal import init
@@ -79,6 +81,7 @@ else:  # hidden from type checkers, which would otherwise accept any name
         "plot": "report.plots",
         "read": "signals.readers",
         "read_parts": "signals.readers",
+        "relearn": "diagnosis.relearn",
         "simulate": "simulation",
         "write_report": "report.diagnosis_page",
     }

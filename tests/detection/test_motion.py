@@ -157,7 +157,7 @@ def test_a_baseline_of_an_earlier_version_says_that_the_check_is_missing(tmp_pat
 def test_healthy_names_what_is_not_watched() -> None:
     said = ss.diagnose(belt(), under("as learned")).summary
     assert said.endswith(
-        "It promises nothing about a change of offset, backlash between actuator and sensor or a compliant drive train."
+        "Not monitored: a change of offset, backlash between actuator and sensor or a compliant drive train."
     )
     stiff = loop().plant.model_copy(update={"friction": "none", "offset": False, "order": 4})
     assert stiff.unwatched == ("backlash", "coulomb_friction", "load")

@@ -56,7 +56,7 @@ def test_why_and_the_refit_beside_the_recursion(loop: Loop) -> None:
             "12.5, 40.4",
             "Another stiffness of the load × 1.190",
             "An input that acts later 0.00400 s",
-            "Nothing in r, u and y tells leakage from these causes",
+            "r, u and y cannot distinguish leakage from these causes",
         ):
             assert words in page.text, words
         assert not page.wrong

@@ -108,7 +108,7 @@ def test_healthy_vibration_is_no_fault() -> None:
     assert unaware is not None and not notes and unaware.vibration_limit == 0.0
     model, notes = fit_axis(loop, [cut(seed) for seed in range(3)])
     assert model is not None and model.vibration_limit > 2.0 * scan_limit(BANDS)
-    assert "shakes more" in str(notes[-1])
+    assert "vibrates more" in str(notes[-1])
     baseline = ss.learn(loop, [cut(seed) for seed in range(3)])
     assert find_axis_change(baseline, cut(5)) is None
     found = find_axis_change(baseline.model_copy(update={"axis": unaware}), cut(5))

@@ -10,6 +10,8 @@ import re
 import shutil
 import subprocess
 import sys
+import sysconfig
+import tarfile
 import tomllib
 import zipfile
 from pathlib import Path
@@ -17,6 +19,7 @@ from pathlib import Path
 import pytest
 
 BUILD = "import hatchling.build, sys; print(hatchling.build.build_wheel(sys.argv[1]))"
+BUILD_SOURCE = "import hatchling.build, sys; print(hatchling.build.build_sdist(sys.argv[1]))"
 
 
 def pinned(path: Path) -> dict[str, str]:
@@ -80,6 +83,51 @@ def test_a_wheel_brings_the_site_which_asks_for_nothing_from_outside(
     (site / "index.html").unlink()
     gone = subprocess.run(argv, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert gone.returncode == 1 and "make docs" in gone.stderr
+
+
+@pytest.mark.slow
+def test_wheel_and_source_archive_are_installed_and_run(project: Path, wheel: Path, tmp_path: Path) -> None:
+    """A fresh environment: packages that servoscope needs are those of the tests, servoscope is that of the wheel."""
+    argv = [sys.executable, "-c", BUILD_SOURCE, str(tmp_path)]
+    name = subprocess.run(argv, cwd=project, check=True, capture_output=True, text=True).stdout.split()[-1]
+    with tarfile.open(tmp_path / name) as archive:
+        archive.extractall(tmp_path, filter="data")
+    other = build(tmp_path / name.removesuffix(".tar.gz"), tmp_path / "other", 0, 1_700_000_000)
+    assert hashlib.sha256(other.read_bytes()).hexdigest() == hashlib.sha256(wheel.read_bytes()).hexdigest()
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path / "env"], check=True)
+    python = tmp_path / "env" / "bin" / "python"
+    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    packages = tmp_path / "env" / "lib" / version / "site-packages"
+    (packages / "tested.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    install = [sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", "--no-index"]
+    subprocess.run([*install, "--ignore-installed", other], check=True)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+
+    def run(*words: str | Path) -> str:
+        done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    assert run(python, "-c", "import servoscope; print(servoscope.__file__)").startswith(str(packages))
+    command = python.with_name("servoscope")
+    assert run(command, "--version").split() == ["servoscope", version_of(project)]
+    run(command, "tutorial")
+    assert "Usable" in run(command, "init", "tutorial/monday.csv", "--yes")
+
+
+def version_of(project: Path) -> str:
+    """Return the version, from the only place that says it."""
+    (version,) = re.findall(r'^__version__ = "(.+)"', (project / "src/servoscope/__init__.py").read_text(), re.M)
+    return str(version)
+
+
+def test_every_version_that_is_named_has_its_section(project: Path) -> None:
+    changes = (project / "CHANGELOG.md").read_text(encoding="utf-8")
+    sections = re.findall(r"^## \[(\d+\.\d+\.\d+)\] - \d{4}-\d\d-\d\d$", changes, re.M)
+    assert sections[0] == version_of(project) and len(set(sections)) == len(sections)
+    assert f"version: {sections[0]}\n" in (project / "CITATION.cff").read_text(encoding="utf-8")
+    named = set(re.findall(r"\bversion (\d+\.\d+(?:\.\d+)?)\b", changes))
+    assert all(any(f"{section}.".startswith(f"{name}.") for section in sections) for name in named)
 
 
 def test_wheels_are_built_with_the_tested_makers_of_pages(project: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import re
 import time
 import tomllib
 from collections.abc import Callable, Iterator
@@ -242,17 +241,13 @@ def test_publishing_neither_raises_nor_blocks_and_closing_twice_is_no_error(kind
     publish()
 
 
-RECIPE_FILE = re.compile(r"^`([\w.-]+)`:\n\n```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-
-
 @pytest.fixture
 def follow(tmp_path: Path, project: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
-    """Follow a recipe of CONTRIBUTING.md: write the files of its package, and install it as `pip install .` would."""
+    """Install a package of `examples/packages`, which CONTRIBUTING.md explains, as `pip install .` would."""
 
-    def write(title: str) -> Path:
-        text = (project / "CONTRIBUTING.md").read_text(encoding="utf-8")
-        section = text.split(f"\n## {title}\n")[1].split("\n## ")[0]
-        files = {name: content for name, content in RECIPE_FILE.findall(section)}
+    def write(package: str) -> Path:
+        folder = project / "examples" / "packages" / package
+        files = {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.*"))}
         assert len(files) == 3
         for name, content in files.items():
             (tmp_path / name).write_text(content, encoding="utf-8")
@@ -286,22 +281,22 @@ def lines_of(samples: list[dict[str, float]]) -> str:
 
 @pytest.mark.parametrize("check", CHECKS)
 def test_the_recipe_for_a_transport_keeps_the_contract(follow: Callable[[str], Path], check: str) -> None:
-    folder = follow("Add a transport")
+    folder = follow("servoscope-spool")
     spool(folder, json.dumps)
     globals()[f"check_{check}"](Harness("spool", {"path": "spool", "payload": SPOOLED}, AXIS, folder))
 
 
 @pytest.mark.parametrize("check", CHECKS)
 def test_the_recipe_for_a_decoder_keeps_the_contract(follow: Callable[[str], Path], check: str) -> None:
-    follow("Add a transport")
-    folder = follow("Add a decoder")
+    follow("servoscope-spool")
+    folder = follow("servoscope-lines")
     spool(folder, lines_of)
     globals()[f"check_{check}"](Harness("lines", {"path": "spool"}, AXIS, folder))
 
 
 def test_what_a_decoder_cannot_use_costs_itself_whatever_it_raises(follow: Callable[[str], Path]) -> None:
-    follow("Add a transport")
-    folder = follow("Add a decoder")
+    follow("servoscope-spool")
+    folder = follow("servoscope-lines")
     spool(folder, lambda samples: lines_of(samples) if samples[0]["r"] != 10 else "1;2")
     source = Harness("lines", {"path": "spool"}, AXIS, folder).create()
     decode = source.decoder.decode
@@ -319,7 +314,7 @@ def test_what_a_decoder_cannot_use_costs_itself_whatever_it_raises(follow: Calla
 
 
 def test_the_recipes_for_sources_work_in_a_service_file(follow: Callable[[str], Path]) -> None:
-    folder = follow("Add a transport")
+    folder = follow("servoscope-spool")
     assert run("run", folder / "hall.toml", "--check").code == 0
     text = (folder / "hall.toml").read_text().replace('"spool"', '"spol"', 1)
     (folder / "wrong.toml").write_text(text)
@@ -329,11 +324,11 @@ def test_the_recipes_for_sources_work_in_a_service_file(follow: Callable[[str], 
     )
     (folder / "wrong.toml").write_text(text.replace('"spol"', '"spool"').replace("path", "pth"))
     one_line(run("run", folder / "wrong.toml", "--check"), "[sources] line.pth: unknown key, did you mean 'path'?")
-    folder = follow("Add a decoder")
+    folder = follow("servoscope-lines")
     assert run("run", folder / "hall.toml", "--check").code == 0
 
 
 def test_the_recipe_for_a_publisher_works(follow: Callable[[str], Path]) -> None:
-    folder = follow("Add a publisher")
+    folder = follow("servoscope-board")
     assert run("run", folder / "hall.toml").code == 0
     assert "press: " in (folder / "board.txt").read_text()

@@ -221,7 +221,7 @@ class TestCommands:
         before = run("history", hall, "--kind", "alarms", "--to", "2026-01-01T00:01", "--json")
         assert before.out == ""
         assert "started" in run("history", hall, "--kind", "audit", "--from", "1h").out
-        assert "version: 0.1" in run("history", hall, "--kind", "audit", "--from", "1h").out
+        assert "version: 1.0" in run("history", hall, "--kind", "audit", "--from", "1h").out
         one_line(run("history", hall, "--asset", "pres"), "no such asset", "press")
         wrong = run("history", hall, "--from", "yesterday")
         assert wrong.code == 2 and "2026-01-31T12:00" in " ".join(wrong.err.split())

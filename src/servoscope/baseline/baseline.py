@@ -27,6 +27,7 @@ from servoscope.baseline.records import (
     HealthyScatter,
     Matrix,
     RecursionTuning,
+    Revision,
     Vector,
     parse_stored_loop,
 )
@@ -74,6 +75,8 @@ class Baseline(ShortRepr, BaselineMemory):
     point, others
         Name of the operating point, empty where none was declared; the baselines of the other points. A baseline with
         others is itself that of the first point.
+    revision
+        Its place in its history: what was relearned, when, by whom and why.
 
     Examples
     --------
@@ -103,6 +106,7 @@ class Baseline(ShortRepr, BaselineMemory):
     covariates: CovariateModel | None = None
     point: str = ""
     others: tuple[Baseline, ...] = ()
+    revision: Revision = Revision()
 
     @model_validator(mode="after")
     def _check_consistency(self) -> Self:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
-from typing import Any, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -65,6 +65,24 @@ class BaselineSource(BaselineModel):
     name: str
     samples: int
     duration_s: float
+
+
+Occasion = Literal["repair", "tool", "product", "season"]
+RENEWALS: tuple[Occasion, ...] = ("repair", "tool", "product")  # what was healthy before says nothing of what is now
+
+
+class Revision(BaselineModel):
+    """How a baseline took the place of an earlier one; what `learn` writes is the first of its history."""
+
+    number: int = 1
+    kind: Literal["first", "healthy", "back"] | Occasion = "first"
+    who: str = ""
+    why: str = ""
+    at: float | None = None  # when [UTC s]
+    parent: int = 0  # number of the one that it was made from, to which one step leads back; 0: none
+    reference: int = (
+        1  # number of the one that slow changes are judged by: the first, or that after the last accepted change
+    )
 
 
 class DetectableChange(BaselineModel):

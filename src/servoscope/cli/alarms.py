@@ -11,7 +11,7 @@ import typer
 from servoscope.cli.app import app
 from servoscope.cli.arguments import parse_duration
 from servoscope.cli.exit import print_json
-from servoscope.cli.options import JsonOption
+from servoscope.cli.options import JsonOption, ReasonOption, UserOption
 from servoscope.cli.service import AssetOption, StoreArgument, check_assets, open_store
 from servoscope.core.errors import AlarmError
 
@@ -20,8 +20,6 @@ app.add_typer(alarms_app, name="alarms")
 
 AssetArgument = Annotated[str, typer.Argument(metavar="ASSET", help="Whose alarm; the service's name for its own.")]
 AlarmArgument = Annotated[str, typer.Argument(metavar="ALARM", help="Name of the alarm, for example fault.")]
-UserOption = Annotated[str | None, typer.Option(metavar="NAME", help="Who asks; default: the user of this terminal.")]
-ReasonOption = Annotated[str, typer.Option(metavar="TEXT", help="Why; kept in the history.")]
 
 COMMAND_TIMEOUT_S = 5.0
 MAX_SHELVING_S = 366 * 86400.0  # shelving has an end

@@ -28,7 +28,7 @@ class CommandGroup(typer.core.TyperGroup):
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return a command by its name; of one that is gone, say what took its place."""
-        if cmd_name == "explore":  # until the next version
+        if cmd_name == "explore":  # until 2.0
             from servoscope.report.page import say
 
             raise ServoscopeError(say("init.explore"))

@@ -45,6 +45,8 @@ ResampleOption = Annotated[
 AxisOption = Annotated[
     str | None, typer.Option(metavar="NAME", help="Of a file with several axes: the one to take, 2 or X for example.")
 ]
+UserOption = Annotated[str | None, typer.Option(metavar="NAME", help="Who asks; default: the user of this terminal.")]
+ReasonOption = Annotated[str, typer.Option(metavar="TEXT", help="Why; kept in the history.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else on stdout.")]
 ReportOption = Annotated[
     Path | None,

@@ -10,13 +10,15 @@ import typer
 from servoscope.cli import arguments, arm
 from servoscope.cli.app import app
 from servoscope.cli.arguments import RecordingReader
+from servoscope.cli.baseline import AfterOption, add_recordings
 from servoscope.cli.exit import EXIT_FAULT, EXIT_INPUT, FailureCounter, print_json
 from servoscope.cli.options import (
     JsonOption,
-    LoopArgument,
     ReadingOptions,
+    ReasonOption,
     ReportOption,
     TraceOption,
+    UserOption,
     with_reading_options,
 )
 from servoscope.cli.output_paths import REPORTS, TRACES, OutputPaths, check_output, recording_stem
@@ -80,8 +82,13 @@ def inspect(
 @app.command()
 @with_reading_options("axis")
 def learn(
-    loop: LoopArgument,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="BASELINE", help="Baseline to write (JSON).")],
+    loop: Annotated[
+        Path | None,
+        typer.Argument(metavar="LOOP", help="Loop file (TOML); with --add a recording.", show_default=False),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="BASELINE", help="Baseline to write (JSON).")
+    ] = None,
     healthy: Annotated[
         list[str] | None,
         typer.Argument(metavar="[POINT=]HEALTHY", help="Healthy recordings, at operating points.", show_default=False),
@@ -108,11 +115,38 @@ def learn(
         list[Path] | None,
         typer.Option(metavar="BASELINE", help="Baseline of a like machine, folder or pattern of them; repeatable."),
     ] = None,
+    add: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[POINT=]HEALTHY",
+            help="Learn the baseline of -b anew with further recordings; keep the earlier one.",
+        ),
+    ] = None,
+    baseline: Annotated[
+        Path | None, typer.Option("-b", "--baseline", metavar="BASELINE", help="With --add: the baseline.")
+    ] = None,
+    after: AfterOption = None,
+    why: ReasonOption = "",
+    who: UserOption = None,
     *,
     reading: ReadingOptions,
     as_json: JsonOption = False,
 ) -> None:
     """Learn from healthy recordings what healthy looks like, and from labelled ones what faults look like."""
+    if add:
+        if baseline is None or output is not None or nominal or compare is not None or fault or population:
+            raise typer.BadParameter(
+                "--add goes with -b BASELINE, and with neither -o nor the options of other recordings"
+            )
+        more = [*add, *([str(loop)] if loop is not None else []), *(healthy or ())]
+        add_recordings(
+            baseline, more, reading, as_json, after, why, who, accept_change, accept_delay=accept_delay, force=force
+        )
+        return
+    if loop is None or output is None:
+        raise typer.BadParameter("give LOOP and -o BASELINE, or --add RECORDING and -b BASELINE")
+    if baseline is not None or after is not None or why or who:
+        raise typer.BadParameter("-b, --after, --why and --who go with --add")
     named = arguments.parse_healthy(healthy or [])
     if nominal == bool(named):
         raise typer.BadParameter("give healthy recordings or --nominal, and not both")
@@ -161,10 +195,10 @@ def learn(
                 labels[point][name] = labels[point].get(name, []) + reader.read(path)
         steps.begin("learning")
         if nominal:
-            baseline = nominal_baseline(settings, steps.advance)
+            learned = nominal_baseline(settings, steps.advance)
         else:
             chosen, known = recordings.get("", recordings), labels.get("", labels)
-            baseline = operating_points.learn(
+            learned = operating_points.learn(
                 settings,
                 chosen,
                 steps.advance,
@@ -175,11 +209,11 @@ def learn(
                 force=force,
                 population=alike,
             )
-        baseline.save(output)
+        learned.save(output)
     if as_json:
-        print_json({"baseline": str(output), **plain_values.baseline_summary(baseline)}, lines=False)
+        print_json({"baseline": str(output), **plain_values.baseline_summary(learned)}, lines=False)
     else:
-        results.print_baseline(results.create_console(), baseline)
+        results.print_baseline(results.create_console(), learned)
         results.print_written_path(results.create_console(), output)
     failures.exit_if_any()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import BaselineError, NotEnoughError
@@ -106,7 +107,7 @@ def learn(
     if not named:
         raise NotEnoughError("no recording to learn from: give at least one healthy recording")
     labels = _group_by_point(faults or {}, recordings)
-    notes = {name: _compare_with_earlier(compare, name, some, progress, accept_change) for name, some in named.items()}
+    notes = {name: compare_with_earlier(compare, name, some, progress, accept_change) for name, some in named.items()}
     learned: list[Baseline] = []
     alikes = _named_machines(population)
     for name, some in named.items():
@@ -158,8 +159,13 @@ def _group_by_point(
     return {point: labels for point, labels in found.items() if labels}
 
 
-def _compare_with_earlier(
-    earlier: Baseline | None, point: str, recordings: Sequence[Recording], progress: Progress, accept: bool
+def compare_with_earlier(
+    earlier: Baseline | None,
+    point: str,
+    recordings: Sequence[Recording],
+    progress: Progress,
+    accept: bool,
+    rank: Literal["earlier", "first"] = "earlier",
 ) -> list[Message]:
     """Return notes on what changed since an earlier baseline; raises BaselineError if the change is not accepted."""
     if earlier is None:
@@ -170,7 +176,7 @@ def _compare_with_earlier(
         diagnosis = diagnose(earlier, rec, point=point if point in earlier.points else None)
         if diagnosis.verdict == "fault" and not accept:
             raise BaselineError(
-                f"{rec.name} is not healthy by the earlier baseline. {diagnosis.summary} Nothing was learned; find the "
+                f"{rec.name} is not healthy by the {rank} baseline. {diagnosis.summary} Nothing was learned; find the "
                 "cause, or accept the change (--accept-change)"
             )
         known = {"recording": rec.name, "hash": earlier.hash}

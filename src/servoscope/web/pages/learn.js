@@ -131,7 +131,7 @@ function told(summary) {
     h(
       "div",
       { class: "columns" },
-      promises.length > 0 && h("div", { class: "half" }, h("h3", {}, "The smallest change that it promises to see"), table("Promises", ["Fault", "Parameter", "*Seen from"], promises)),
+      promises.length > 0 && h("div", { class: "half" }, h("h3", {}, "The smallest change that it detects"), table("Promises", ["Fault", "Parameter", "*Seen from"], promises)),
       values.length > 0 && h("div", { class: "half" }, h("h3", {}, "Coefficients, in units of u per derivative of y [s]"), table("Learned coefficients", ["Name", "*Value", "*Standard deviation"], values)),
     ),
     (summary.notes ?? []).length > 0 && h("ul", { class: "why" }, summary.notes.map((words) => h("li", {}, prose(typeof words === "string" ? words : (words.message ?? ""))))),

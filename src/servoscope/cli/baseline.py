@@ -1,0 +1,161 @@
+"""The commands ``servoscope baseline ...``, and ``learn --add``: history and comparison of baselines."""
+
+from __future__ import annotations
+
+import getpass
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from servoscope.cli.app import app
+from servoscope.cli.arguments import RecordingReader, parse_healthy
+from servoscope.cli.exit import print_json
+from servoscope.cli.options import JsonOption, ReadingOptions, ReasonOption, UserOption
+from servoscope.cli.progress import show_steps
+
+if TYPE_CHECKING:
+    from servoscope.baseline.baseline import Baseline
+
+baseline_app = typer.Typer(no_args_is_help=True, help="What became of a baseline, and what differs between two.")
+app.add_typer(baseline_app, name="baseline")
+
+BaselineArgument = Annotated[Path, typer.Argument(metavar="BASELINE", help="Baseline file (JSON).")]
+AfterOption = Annotated[
+    Literal["repair", "tool", "product", "season"] | None,
+    typer.Option(help="With --add: what was done before. All but a season replace the earlier recordings."),
+]
+
+
+def add_recordings(
+    path: Path,
+    texts: Sequence[str],
+    reading: ReadingOptions,
+    as_json: bool,
+    after: Literal["repair", "tool", "product", "season"] | None,
+    why: str,
+    who: str | None,
+    accept_change: bool,
+    *,
+    accept_delay: bool,
+    force: bool,
+) -> None:
+    """Learn a baseline anew with further recordings, and print what differs."""
+    from servoscope.baseline.baseline import Baseline
+    from servoscope.cli.render import results
+    from servoscope.diagnosis.relearn import relearn
+    from servoscope.signals import Recording
+
+    before, named = Baseline.load(path), parse_healthy(list(texts))
+    reader = RecordingReader.from_options(before.loop, reading)
+    recordings: dict[str, list[Recording | Path]] = {point: [] for point, _ in named}
+    with show_steps(len(named) + 1, 8) as steps:
+        for point, file in named:
+            steps.begin(file.name)
+            recordings[point] += reader.read(file)
+        steps.begin("learning")
+        folders = [file.parent for _, file in named]
+        learned = relearn(
+            path,
+            recordings,
+            steps.advance,
+            after=after,
+            who=who or getpass.getuser(),
+            why=why,
+            accept_change=accept_change,
+            accept_delay=accept_delay,
+            force=force,
+            folders=folders,
+        )
+    print_difference(before, learned, as_json)
+    if not as_json:
+        results.print_notes(results.create_console(), learned.notes)
+        results.print_written_path(results.create_console(), path)
+
+
+def print_difference(before: Baseline, after: Baseline, as_json: bool) -> None:
+    """Print what moved between two baselines, and what each of them can detect."""
+    from servoscope.baseline.comparison import compare_baselines
+    from servoscope.cli.render import results
+    from servoscope.report.format_values import format_percent
+
+    differences = compare_baselines(before, after)
+    if as_json:
+        points = [each.to_dict() for each in differences]
+        revision = after.revision.model_dump(mode="json")
+        print_json({"before": before.hash, "after": after.hash, "revision": revision, "points": points}, lines=False)
+        return
+    out = results.create_console()
+    for each in differences:
+        if each.point:
+            results.print_title(out, each.point, "")
+        moves = [
+            (
+                row.name,
+                f"{row.before:.4g}",
+                f"{row.after:.4g}",
+                _signed(row.change),
+                "" if row.certain else "within its scatter",
+            )
+            for row in each.moves
+        ]
+        results.print_table(out, ("parameter", "before", "after", "change", ""), moves)
+        sizes = [
+            (row.name, *("never" if size is None else format_percent(size) for size in (row.before, row.after)))
+            for row in each.detectable
+        ]
+        results.print_table(out, ("fault", "detected from, before", "after"), sizes)
+
+
+def _signed(change: float | None) -> str:
+    return "" if change is None else f"{100.0 * change:+.1f} %"
+
+
+@baseline_app.command("log")
+def print_log(path: BaselineArgument, as_json: JsonOption = False) -> None:
+    """List the baselines of a file: when each was learned, by whom, why, and from what."""
+    from servoscope.baseline.history import read_history
+    from servoscope.cli.render import results
+    from servoscope.core.messages import FORMATS
+
+    rows = [
+        {
+            **each.revision.model_dump(mode="json"),
+            "hash": each.hash,
+            "sources": [source.name for point in each.per_point for source in point.sources],
+        }
+        for each in read_history(path).values()
+    ]
+    if as_json:
+        print_json(rows, lines=False)
+        return
+    header = ("number", "when", "kind", "who", "why", "recordings")
+    cells = [
+        (
+            str(row["number"]),
+            FORMATS["utc"](row["at"]) if row["at"] is not None else "",
+            *(row[key] for key in ("kind", "who", "why")),
+            str(len(row["sources"])),
+        )
+        for row in rows
+    ]
+    results.print_table(results.create_console(), header, cells, 5)
+
+
+@baseline_app.command()
+def diff(before: BaselineArgument, after: BaselineArgument, as_json: JsonOption = False) -> None:
+    """Say what moved between two baselines, and which changes each of them can detect."""
+    from servoscope.baseline.baseline import Baseline
+
+    print_difference(Baseline.load(before), Baseline.load(after), as_json)
+
+
+@baseline_app.command()
+def back(path: BaselineArgument, who: UserOption = None, why: ReasonOption = "", as_json: JsonOption = False) -> None:
+    """Put the baseline in force that the present one was made from; the present one is kept."""
+    from servoscope.baseline.baseline import Baseline
+    from servoscope.baseline.history import step_back
+
+    before = Baseline.load(path)
+    print_difference(before, step_back(path, who or getpass.getuser(), why), as_json)

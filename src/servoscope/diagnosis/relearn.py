@@ -1,0 +1,153 @@
+"""Relearning: further healthy recordings join a baseline, or replace what was learned before a repair."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.history import history_folder, read_history, replace_baseline
+from servoscope.baseline.records import RENEWALS, Occasion, Revision
+from servoscope.core.errors import BaselineError
+from servoscope.core.messages import Message, message
+from servoscope.diagnosis.operating_points import compare_with_earlier, learn
+from servoscope.learning.learn import Progress
+from servoscope.models.loop import Columns
+from servoscope.signals import Recording, readers
+from servoscope.signals.readers import as_recording
+from servoscope.signals.readers.frames import Source
+
+
+def relearn(
+    path: str | Path,
+    recordings: Sequence[Recording | Source] | Mapping[str, Sequence[Recording | Source]],
+    progress: Progress = lambda _: None,
+    *,
+    after: Occasion | None = None,
+    who: str = "",
+    why: str = "",
+    accept_change: bool = False,
+    accept_delay: bool = False,
+    force: bool = False,
+    folders: Sequence[Path] = (),
+    leave_out: bool = False,
+    save: bool = True,
+) -> Baseline:
+    """Learn a baseline anew with further healthy recordings, and put it in force; the earlier one is kept.
+
+    Nothing is learned from a recording that is a fault to the baseline in force, or to the reference of its history:
+    the first baseline, or that after the last accepted change. So a slow fault is not learned in small steps.
+
+    Parameters
+    ----------
+    path
+        The baseline file.
+    recordings
+        New healthy recordings, or what `read` reads; by the name of their operating point where the baseline has some.
+    progress
+        Called with the name of each step.
+    after
+        What was announced before them. After a repair, or a change of tool or product, they replace the earlier
+        recordings; those of another season join them. In both cases a change is expected, and is noted instead of
+        refused. None: nothing was done, and the recordings join the earlier ones.
+    who, why
+        Who relearned, and the reason; both are kept in the history.
+    accept_change
+        Learn although a recording is a fault; the notes then say so.
+    accept_delay, force
+        As in `learn`.
+    folders
+        Where earlier recordings are looked for, besides the folders of the baseline and of the new recordings.
+    leave_out
+        Leave out earlier recordings that are not found any more, and note it, instead of refusing.
+    save
+        Whether it is put in force; otherwise it is returned only, for a preview.
+
+    Returns
+    -------
+    Baseline
+        With its `revision`.
+
+    Raises
+    ------
+    BaselineError
+        If a recording is a fault and the change is not accepted, if the baseline is of another number of operating
+        points, or if an earlier recording is not found in the folder of the baseline or of the new recordings.
+    NotEnoughError, RecordingError, LoopError
+        As in `learn`.
+    OutputError
+        If a file cannot be written.
+
+    Examples
+    --------
+    >>> preview = relearn("baseline.json", ["wednesday.csv"], save=False)
+    >>> preview.revision.number, len(preview.sources)
+    (2, 3)
+    """
+    path, history = Path(path), read_history(Path(path))
+    *_, earlier = history.values()
+    loop, known = earlier.loop, earlier.revision
+    given = recordings if isinstance(recordings, Mapping) else {"": recordings}
+    if strange := set(given) - {each.point for each in earlier.per_point}:
+        names = ", ".join(earlier.points) or "none"
+        raise BaselineError(f"{path}: has no operating point {min(strange)!r}, choose from {names}")
+    folders = [path.parent, history_folder(path), *folders]
+    folders += [Path(each).parent for some in given.values() for each in some if isinstance(each, str | Path)]
+    new = {point: [as_recording(each, loop) for each in some] for point, some in given.items()}
+    notes: dict[str, list[Message]] = {}
+    reference = history.get(known.reference, earlier)
+    for point, some in new.items():
+        notes[point] = compare_with_earlier(earlier, point, some, progress, accept_change or after is not None)
+        if reference is not earlier:
+            compare_with_earlier(reference, point, some, progress, accept_change or after is not None, "first")
+    kept: dict[str, list[Recording]] = {}
+    for each in () if after in RENEWALS else earlier.per_point:
+        kept[each.point], missing = find_sources(each, folders)
+        if missing and not leave_out:
+            raise BaselineError(
+                f"{path}: its recording {missing[0]} is not in {' or '.join(dict.fromkeys(map(str, folders)))}: put it "
+                "there, or learn from the new recordings alone (after a repair, for example)"
+            )
+        notes.setdefault(each.point, []).extend(message("learning.source_missing", recording=name) for name in missing)
+    together = {each.point: [*kept.get(each.point, ()), *new.get(each.point, ())] for each in earlier.per_point}
+    chosen = together.get("", together)
+    baseline = learn(loop, chosen, progress, accept_delay=accept_delay, force=force)
+    number = max(history) + 1
+    changed = any(note.key == "learning.accepted" for some in notes.values() for note in some)
+    revision = Revision(
+        number=number,
+        kind=after or "healthy",
+        who=who,
+        why=why,
+        at=time.time(),
+        parent=known.number,
+        reference=number if changed or after in RENEWALS else known.reference,
+    )
+    points = [
+        each.model_copy(update={"notes": (*each.notes, *notes.get(each.point, ())), "learned": before.learned})
+        for each, before in zip(baseline.per_point, earlier.per_point, strict=True)
+    ]
+    baseline = points[0].model_copy(update={"others": tuple(points[1:]), "revision": revision})
+    if save:
+        replace_baseline(path, baseline)
+    return baseline
+
+
+def find_sources(baseline: Baseline, folders: Sequence[Path]) -> tuple[list[Recording], list[str]]:
+    """Return the recordings that a baseline was learned from, and the names of those that are in none of the folders.
+
+    A file of another number of samples is another recording. Samples that a service kept have their own columns.
+    """
+    loop, recordings, missing = baseline.loop, list[Recording](), list[str]()
+    own = Columns(output=loop.columns.output, covariates={name: name for name in loop.columns.covariates})
+    for source in baseline.sources:
+        files = [folder / source.name for folder in folders if (folder / source.name).is_file()]
+        for file in files:
+            recording = readers.read(file, loop, columns=own if file.parent.suffix == ".history" else None)
+            if recording.samples == source.samples:
+                recordings.append(recording)
+                break
+        else:
+            missing.append(source.name)
+    return recordings, missing
