@@ -45,7 +45,9 @@ format: $(STAMP)  ## put the code into shape
 figures: $(STAMP)  ## run the programs behind the figures of the documents, and print what differs (half an hour)
 	$(BIN)/python scripts/figures.py --run
 
-pictures: $(STAMP)  ## the pictures of the pages in docs/images/pages, from the browser's tests
+pictures: $(STAMP)  ## the report in README, and the pages in docs/images/pages, from the browser's tests
+	$(BIN)/servoscope demo -o demo-output
+	$(BIN)/python scripts/screenshot.py demo-output/report.html docs/images/report.png
 	SCREENSHOTS=docs/images/pages $(BIN)/python -m pytest -n 0 tests/web/test_web_pages.py tests/web/test_web_action.py tests/web/test_web_files.py
 
 docs: $(STAMP)     ## the site of docs/, as wheels have it: servoscope docs opens it

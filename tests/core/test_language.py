@@ -46,6 +46,37 @@ def test_what_pages_say_keeps_its_values(language: str) -> None:
     assert [one for one, text in known.items() if sorted(place.findall(one)) != sorted(place.findall(text))] == []
 
 
+def written_sentences(source: str) -> Iterator[str]:
+    """Sentences and phrases that a module of the pages writes out, each value in them as 7."""
+    source = re.sub(r"(^|\s)//.*$|class: \"[^\"]*\"", "", source, flags=re.M)
+    source = re.sub(r"\$\{[^{}]*: \"s\"\}", "s", source)  # of a plural
+    templates = re.compile(r"`((?:[^`\\]|\\.)*)`")
+    texts = [re.sub(r"\$\{[^{}]*(\{[^{}]*\}[^{}]*)*\}", "7", text) for text in templates.findall(source)]
+    texts += re.findall(r'"((?:[^"\\\n]|\\.)*)"', templates.sub("", source))
+    code = re.compile(r"^(plot tall|servoscope run|color-mix|no such)|  # |\$\{")
+    for words in (text.strip().removeprefix("*") for text in texts):
+        if re.search(r"[a-z]{2,} [a-z]{2,}", words) and not code.search(words):
+            yield words
+
+
+@pytest.mark.parametrize("language", OTHERS)
+def test_the_pages_write_no_sentence_that_the_catalogue_lacks(language: str) -> None:
+    texts = [key.partition(".")[2] for key in catalogue(language) if key.startswith(("word.", "page."))]
+    shapes = [re.compile(re.sub(r"\\{\d(\\#|!w)?\\}", ".*", re.escape(text))) for text in texts]
+
+    def is_known(words: str) -> bool:
+        own = re.escape(words).replace("7", ".*")  # a part of a sentence, or one whose value is a word
+        small = words[:1].lower() + words[1:]
+        return any(shape.fullmatch(words) or shape.fullmatch(small) for shape in shapes) or any(
+            re.search(own, text) for text in texts
+        )
+
+    pages = sorted(Path(str(messages.FOLDER)).parents[1].glob("web/pages/*.js"))
+    written = [(path.name, words) for path in pages for words in written_sentences(path.read_text(encoding="utf-8"))]
+    assert len(written) > 200
+    assert [(name, words) for name, words in written if not is_known(words)] == []
+
+
 def visible(page: str) -> str:
     """The words of a page that are sentences and headings: neither settings nor identifiers."""
     page = re.sub(r"<style>.*?</style>|<h2>Einstellungen</h2>.*?</section>", " ", page, flags=re.S)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.records import ExactPredictorFit
 from servoscope.cli.render.design import print_study
 from servoscope.core.errors import LoopError, SimulationError
+from servoscope.core.messages import speak
 from servoscope.design import BaselineStudy, DesignStudy, study, study_baseline
 from servoscope.design.detectability import AlarmPower, detectable_size
 from servoscope.design.fisher_information import (
@@ -294,6 +296,11 @@ class TestCommand:
         assert html == design_page.render_design_page(said)
         assert html.count("<svg") == 2
         assert "http" not in html.replace("http-equiv", "")
+        with speak("de"):  # page and terminal
+            out = io.StringIO()
+            print_study(Console(file=out, width=100), said)
+            text = re.sub(r"<style>.*?</style>|<[^>]*>", " ", design_page.render_design_page(said), flags=re.S)
+        assert re.findall(r".{30}\b(the|which|from|size|never|told|most|samples|change)\b", text + out.getvalue()) == []
 
     @pytest.mark.parametrize(
         ("old", "new", "told"),

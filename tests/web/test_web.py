@@ -159,7 +159,7 @@ def test_an_asset_in_detail(client: httpx.Client) -> None:
     limits = {(one["fault"], one["kind"]): one for one in client.get("/assets/press/limits").json()["limits"]}
     assert limits["pump", "tracking"]["down"] == pytest.approx(0.41, abs=0.01)
     row = next(one for one in client.get("/assets").json()["assets"] if one["asset"] == "press")
-    assert row["source"] == "line"
+    assert row["source"] == "line" and client.get("/assets").json()["configured"] == 2
 
 
 def test_history_is_thinned_and_keeps_what_was_largest(client: httpx.Client, folder: Path) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
@@ -137,7 +140,12 @@ SITUATIONS = {
         ("Undetermined: y stays the same, sensor or axis is stuck", AT, "check sensor, cable"),
     ),
     "silent": Situation(
-        {"verdict": "undetermined", "summary": "Undetermined: no data come.", "reception": "silent"},
+        {
+            "verdict": "undetermined",
+            "summary": "Undetermined: no data come.",
+            "reception": "silent",
+            "alarms": {"reception": {"state": "unacknowledged", "since": NOW, "priority": "medium", "cause": ""}},
+        },
         None,
         ("Undetermined: no data come", AT, "check topic or nodes"),
     ),
@@ -159,6 +167,17 @@ def stored(name: str, situation: Situation) -> dict[str, Any]:
     return {"asset": name, "sequence": 1, "state": b"", "status": status, "at": NOW}
 
 
+# of the asset "step", seconds before its diagnosis: alarm, states before and after, what happened, and by whom
+STEPS = (
+    (5000.0, "fault", "normal", "unacknowledged", "occur", ""),
+    (4000.0, "fault", "unacknowledged", "acknowledged", "acknowledge", "otto"),
+    (3000.0, "fault", "acknowledged", "normal", "clear", ""),
+    (2500.0, "data_quality", "normal", "unacknowledged", "occur", ""),
+    (2000.0, "data_quality", "unacknowledged", "returned_unacknowledged", "clear", ""),
+    (470.0, "fault", "normal", "unacknowledged", "occur", ""),
+)
+
+
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     folder = tmp_path_factory.mktemp("night")
@@ -168,7 +187,11 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         if situation.full is not None:
             row = {"asset": name, "number": 1, "t": NOW, "grounds": "full", **situation.full.columns()}
             batch.rows["diagnoses"].append(row)
+    for number, (ago, alarm, before, after, event, who) in enumerate(STEPS, start=10):
+        row = {"asset": "step", "number": number, "t": NOW - ago, "alarm": alarm, "before": before, "after": after}
+        batch.rows["transitions"].append(row | {"cause": "", "who": who, "document": {"event": event}})
     store.write(batch, "hall", 1)
+    store.add_audit("otto", "step", "note", {"t": NOW - 3000.0, "text": "seal replaced", "anew": True})
     store.close()
     base = f"http://127.0.0.1:{screens.free_port()}"
     with screens.process("serve", "--store", "history.sqlite", "--listen", base.removeprefix("http://"), cwd=folder):
@@ -199,3 +222,73 @@ def test_the_first_screen_says_what_since_when_and_what_to_do(page: Any, address
             assert box["y"] + box["height"] <= height, (words, width)
         assert not re.search(r"T²|CUSUM|σ|iFRF|_friction", verdict.inner_text())
     accessible(page)
+
+
+def test_a_timeline_shows_what_has_happened(page: Any, address: str, tmp_path: Path) -> None:
+    page.set_viewport_size({"width": 1366, "height": 768})
+    page.goto(f"{address}/assets/step")
+    label = "What has happened to this asset over time"
+    playwright.expect(page.get_by_text("Nothing has been followed yet")).to_be_visible()
+    playwright.expect(page.get_by_role("img", name=re.compile("^Size over time"))).to_be_hidden()  # it has no values
+    page.get_by_label(f"View and save: {label}").click()
+    with page.expect_download() as download:
+        page.get_by_role("button", name=f"Save the values: {label}").click()
+    download.value.save_as(tmp_path / "timeline.csv")
+    with (tmp_path / "timeline.csv").open(encoding="utf-8", newline="") as file:
+        rows = [(row["what"], *(_seconds_ago(row[end]) for end in ("from", "to"))) for row in csv.DictReader(file)]
+    assert rows == [
+        ("Fault", 5000.0, 3000.0),
+        ("Answers", 4000.0, None),
+        ("Notes", 3000.0, None),
+        ("Data", 2500.0, 2000.0),
+        ("Fault", 480.0, 0.0),  # from its onset on, and until now
+        ("Diagnoses", 0.0, None),
+    ]
+
+
+def _seconds_ago(date: str) -> float | None:
+    return NOW - datetime.fromisoformat(date).timestamp() if date else None
+
+
+def test_alarm_and_diagnosis_lead_to_each_other_and_several_are_answered_at_once(page: Any, address: str) -> None:
+    page.goto(f"{address}/alarms")
+    page.get_by_role("link", name="reasons").click()
+    playwright.expect(page.get_by_role("heading", level=1)).to_have_text("Diagnosis of gone")
+    page.get_by_role("link", name="Its alarms").click()
+    rows = page.get_by_role("table").first.get_by_role("row")
+    playwright.expect(rows).to_have_count(1 + 1)
+    page.get_by_label("Search alarms").fill("")
+    playwright.expect(rows).to_have_count(1 + 2)
+    page.get_by_role("button", name="Acknowledge these 2").click()
+    playwright.expect(page.get_by_text("Asked for: the service carries it out")).to_be_visible()
+
+
+def test_a_fleet_without_assets_leads_to_the_first_one(page: Any, tmp_path: Path) -> None:
+    base = f"http://127.0.0.1:{screens.free_port()}"
+    with screens.process("serve", "--store", "new.sqlite", "--listen", base.removeprefix("http://"), cwd=tmp_path):
+        empty = until(lambda: asked(base, "/assets"))
+        page.goto(base)
+        playwright.expect(page.get_by_role("heading", name="Add a machine")).to_be_visible()
+        playwright.expect(page.get_by_role("link", name="Begin with a log")).to_have_attribute("href", "/begin")
+        accessible(page)
+        page.route("**/api/v1/assets", lambda route: route.fulfill(json=empty | {"configured": 6}))
+        page.goto(base)
+        playwright.expect(page.get_by_text("6 assets are configured, waiting for the first samples.")).to_be_visible()
+        page.unroute("**/api/v1/assets")
+
+
+def test_a_phone_shows_machines_first(page: Any, address: str) -> None:
+    page.set_viewport_size({"width": 390, "height": 844})
+    page.goto(address)
+    first = page.get_by_role("row").filter(has=page.get_by_role("link", name="drift", exact=True))
+    playwright.expect(first).to_contain_text("× 4.04: friction")
+    assert first.bounding_box()["y"] < 250.0
+    playwright.expect(page.get_by_label("Order")).to_be_hidden()
+    page.get_by_role("button", name="Filters and map").click()
+    playwright.expect(page.get_by_label("Order")).to_be_visible()
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    titles = page.locator(".titles > span")
+    page.set_viewport_size({"width": 1366, "height": 768})
+    playwright.expect(titles.filter(visible=True)).to_have_text(
+        ["State", "Asset", "What is known", "Lasting", "Distance / limit", "Data", "Alarms", "Sample"]
+    )  # no group, no limit, no growth

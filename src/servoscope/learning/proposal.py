@@ -242,6 +242,8 @@ def _further_columns(
     slow = {}
     for name, values in _column_values(opened, list(kinds), where).items():
         x = values[np.isfinite(values)]
+        if not x.size or x.min() == x.max():  # in the chosen rows
+            continue
         blocks = np.array_split(x, max(x.size // memory, 1))
         if np.var([block.mean() for block in blocks]) >= MIN_SLOW_SHARE * np.var(x):
             slow[re.sub(r"\W+", "_", split_unit(name)[0]).strip("_").lower() or kinds[name]] = name

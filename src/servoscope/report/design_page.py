@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from servoscope.core.messages import count_words, translate
 from servoscope.design import BaselineStudy, DesignStudy
 from servoscope.report.format_values import (
     DASH,
@@ -61,7 +62,7 @@ def faults_table(study: DesignStudy) -> ResultTable:
                 f"{format_change(low)} to {format_change(high) if high else 'the end'}"
                 for low, high in side.unclear[1:]
             )
-            name = f"{fault.name} {direction}", fault.parameter
+            name = f"{translate(fault.name)} {translate(direction)}", fault.parameter
             rows.append((*name, *map(format_change, sizes), side.nearest, again or DASH))
     head = ("Change", "Parameter", "Detected from", "Named from", "Linear bound", "Else taken for", "Unclear again")
     return ResultTable(head, rows, words=2)
@@ -71,7 +72,7 @@ def learned_table(study: BaselineStudy) -> ResultTable:
     """Return from which size on each fault is detected and named, by a baseline alone."""
 
     def size(change: float | None) -> str:
-        return format_percent(change) if change is not None and change < MAX_STD_SHOWN else "never"
+        return format_percent(change) if change is not None and change < MAX_STD_SHOWN else translate("never")
 
     rows = [
         (name, fault.parameter, size(fault.detectable), size(fault.isolable), fault.nearest)
@@ -83,7 +84,10 @@ def learned_table(study: BaselineStudy) -> ResultTable:
 def limits_table(study: DesignStudy) -> ResultTable:
     """Return from which size on the loop no longer does its work, in both directions of each fault."""
     rows = [
-        (f"{fault.name} {direction}", *("never" if x is None else f"{x:g}" for x in (side.tracking, side.stability)))
+        (
+            f"{translate(fault.name)} {translate(direction)}",
+            *(translate("never") if x is None else f"{x:g}" for x in (side.tracking, side.stability)),
+        )
         for fault in study.faults.values()
         for direction, side in (("up", fault.up), ("down", fault.down))
     ]
@@ -102,8 +106,8 @@ def mimics_table(study: DesignStudy, *, described: bool = False) -> ResultTable:
 
     def amount(value: float | None, unit: str) -> str:
         if value is None:
-            return "never"
-        return format_percent(value) if unit == "relative" else f"{value:.2g} samples"
+            return translate("never")
+        return format_percent(value) if unit == "relative" else count_words(f"{value:.2g}", "sample")
 
     rows: list[tuple[str, ...]] = [
         (

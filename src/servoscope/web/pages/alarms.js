@@ -1,6 +1,6 @@
 // Alarms that are not normal, the most urgent first, with what to do about them; and what has happened to alarms.
-import { get, part, query } from "./api.js";
-import { commands, STATES } from "./commands.js";
+import { get, mayChange, part, query } from "./api.js";
+import { commands, sendCommand, STATES } from "./commands.js";
 import { h, section, table, tell, translate } from "./dom.js";
 import { follow } from "./live.js";
 import { priority, prose } from "./marks.js";
@@ -17,11 +17,13 @@ export async function show(main, { session, signal, linked, values }) {
   const state = h("select", {}, h("option", { value: "" }, "All"), h("option", { value: "open" }, "To acknowledge"), h("option", { value: "aside" }, "Shelved, suppressed, out of service"));
   const search = h("input", { type: "search", value: asset, placeholder: "Search", "aria-label": "Search alarms" });
   state.setAttribute("aria-label", translate("Show"));
+  let waiting = []; // of those shown: search and choice say which
+  const all = h("button", { type: "button", hidden: true, onclick: () => answerAll() });
   let alarms = [];
   let now = 0;
 
   main.replaceChildren(
-    h("div", { class: "head" }, h("h1", {}, "Alarms"), h("span", { class: "gap" }), state, search),
+    h("div", { class: "head" }, h("h1", {}, "Alarms"), h("span", { class: "gap" }), all, state, search),
     flood,
     standing,
     said,
@@ -35,6 +37,13 @@ export async function show(main, { session, signal, linked, values }) {
     look().catch(() => {}); // what went wrong with the command is said already
   };
 
+  async function answerAll() {
+    all.disabled = true;
+    const answers = Promise.all(waiting.map((one) => sendCommand(one, "acknowledge", {})));
+    await answers.then((said) => heard(said.find(Boolean) ?? null), (error) => heard(error.message));
+    all.disabled = false;
+  }
+
   function draw() {
     const wanted = search.value.trim().toLowerCase();
     const shown = alarms.filter((one) => {
@@ -43,6 +52,9 @@ export async function show(main, { session, signal, linked, values }) {
       const text = `${one.asset} ${one.alarm} ${one.cause} ${one.priority}`.toLowerCase();
       return (!state.value || (state.value === "open" ? open : aside)) && text.includes(wanted);
     });
+    waiting = mayChange(session.role, "operator") ? shown.filter((one) => one.commands.includes("acknowledge")) : [];
+    all.hidden = waiting.length < 2;
+    tell(all, `Acknowledge these ${waiting.length}`);
     const focused = document.activeElement?.getAttribute?.("aria-label");
     standing.replaceChildren(
       shown.length
@@ -66,7 +78,7 @@ export async function show(main, { session, signal, linked, values }) {
       one.priority ? priority(one.priority) : DASH,
       `${STATES[one.state]}${until}`,
       h("span", { class: "t", title: `${duration(now - one.since)} ago` }, moment(one.since)),
-      one.cause ? h("span", {}, prose(one.cause)) : DASH,
+      h("span", {}, one.cause ? prose(one.cause) : DASH, one.diagnosis && [" ", h("a", { class: "t", href: `/diagnoses/${part(one.diagnosis.id)}` }, "reasons")]),
       one.checks.length ? h("ul", { class: "why" }, one.checks.flatMap((check) => check.texts.map((text) => h("li", {}, prose(text)))), answer && h("li", {}, h("small", {}, answer))) : h("span", {}, todo || DASH, answer && h("small", {}, ` ${answer}`)),
       commands(one, session, heard),
     ];
@@ -82,15 +94,15 @@ export async function show(main, { session, signal, linked, values }) {
   }
 
   await look();
-  let waiting = 0;
+  let timer = 0;
   const soon = () => {
-    waiting ||= setTimeout(() => {
-      waiting = 0;
+    timer ||= setTimeout(() => {
+      timer = 0;
       look().catch(() => {}); // the stream says that the service is gone
     }, OFTEN_MS);
   };
   follow("", ["alarm", "services"], soon, linked, signal);
-  signal.addEventListener("abort", () => clearTimeout(waiting));
+  signal.addEventListener("abort", () => clearTimeout(timer));
 }
 
 // Steps of alarms, the newest first.

@@ -14,12 +14,14 @@ import { badge, priority, prose, STATUS, VERDICTS } from "./marks.js";
 import { parameters } from "./parameters.js";
 import { periods } from "./periods.js";
 import { planes } from "./planes.js";
+import { timeline } from "./timeline.js";
 import { capital, count, DASH, moment, multiple, number, plain } from "./words.js";
 
 const SPANS = { "1 h": 3600, "24 h": 86400, "7 d": 604800, "30 d": 2592000, "1 y": 31536000 };
 const SIGNALS = { "30 s": 30, "10 min": 600, "1 h": 3600 };
 const SIGNALS_EVERY_MS = 2000;
 const POINTS = 500;
+const LISTED = 20; // diagnoses
 
 export async function show(main, { session, signal, linked, values, part: name, entitle }) {
   entitle(name);
@@ -31,6 +33,7 @@ export async function show(main, { session, signal, linked, values, part: name, 
   const plane = planes(asset.responses, units.response ?? "", signal);
   const sizes = parameters(asset.parameters);
   const grown = growth(path, name, () => asset, { session, values, signal });
+  const happened = timeline(path, () => asset, signal);
   const said = h("p", { class: "working", role: "status" });
   const [standing, past, diagnoses, counted] = [h("div", {}), h("div", {}), h("div", {}), h("p", { class: "note" })];
   const certainty = h("div", {});
@@ -52,6 +55,7 @@ export async function show(main, { session, signal, linked, values, part: name, 
       { class: "columns" },
       half(section("Alarms", null, standing, said, past)),
       half(section("Diagnoses", null, diagnoses)),
+      happened.element,
       grown.element,
       half(titled("Signals", lengths, samples)),
       signed,
@@ -107,12 +111,12 @@ export async function show(main, { session, signal, linked, values, part: name, 
   }
 
   async function look() {
-    const [alarms, found] = await Promise.all([get(query(`${path}/alarms`, { last: 50 }), signal), get(query("/diagnoses", { asset: name, last: 20 }), signal)]);
+    const [alarms, found] = await Promise.all([get(query(`${path}/alarms`, { last: 50 }), signal), get(query("/diagnoses", { asset: name, last: 50 }), signal)]);
     past.replaceChildren(steps(alarms.transitions, false));
-    diagnoses.replaceChildren(list(found.diagnoses));
+    diagnoses.replaceChildren(list(found.diagnoses.slice(-LISTED)));
     const inFull = found.diagnoses.filter((one) => one.grounds === "full");
     await explain(inFull.at(-1), inFull.find((one) => one.t >= began(asset)));
-    await grown.load();
+    await Promise.all([grown.load(), happened.load(found.diagnoses)]);
   }
 
   // The motion by the last full diagnosis, beside that of the first one of this fault.

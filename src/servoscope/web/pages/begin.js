@@ -43,7 +43,7 @@ export async function show(main, { session, signal, values }) {
     history.replaceState(null, "", `/begin?upload=${part(one.id)}`);
     chosen.replaceChildren(...steps(one, session, signal));
   };
-  const note = "Of the healthy machine at work, a minute or more: what was asked (reference r), what the controller put out (input u), what the machine did (output y).";
+  const note = "A minute or more of the healthy machine at work: set point (reference r), output of the controller (input u), measured motion (output y).";
   work.append(section("Log", note, dropzone("Drop a log here", false, open, signal, () => chosen.replaceChildren()), (await earlier(open, signal)) ?? ""), chosen);
   if (values.get("upload")) await get(`/uploads/${part(values.get("upload"))}`, signal).then(open, () => {}); // if it is still there
 }

@@ -24,13 +24,16 @@ export const STATES = {
   out_of_service: "out of service",
 };
 
+// Sends a command on an alarm, and returns what is to be said of it, null once it was carried out.
+export async function sendCommand(alarm, command, body) {
+  const answer = await post(`/assets/${part(alarm.asset)}/alarms/${part(alarm.alarm)}/${command}`, body);
+  return answer.outcome === null ? "Asked for: the service carries it out as soon as it runs." : null;
+}
+
 // Buttons for an alarm; `said` hears what became of a command, `null` once it was carried out.
 export function commands(alarm, session, said) {
   if (!mayChange(session.role, "operator")) return h("small", {}, "operators answer");
-  const send = async (command, body) => {
-    const answer = await post(`/assets/${part(alarm.asset)}/alarms/${part(alarm.alarm)}/${command}`, body);
-    said(answer.outcome === null ? "Asked for: the service carries it out as soon as it runs." : null);
-  };
+  const send = async (command, body) => said(await sendCommand(alarm, command, body));
   const press = async (command) => {
     for (const button of made) button.disabled = true; // the service takes a moment
     try {

@@ -2,7 +2,7 @@
 import { get, job, mayChange, part, query } from "./api.js";
 import { axis, legend, plot, tooltip } from "./charts.js";
 import { short } from "./curves.js";
-import { complaint, field, h, section, table, tell } from "./dom.js";
+import { complaint, field, h, section, table, tell, translate } from "./dom.js";
 import { loopChoice } from "./loops.js";
 import { prose } from "./marks.js";
 import { capital, change, DASH, moment, number, general, plain, unit } from "./words.js";
@@ -87,14 +87,14 @@ function studied(study, drawn, signal) {
       table(
         "Radii of faults",
         ["Change", "*Detected from", "*Named from", "*Linear bound", "Else taken for"],
-        sides.map(([fault, way, side]) => [h("span", {}, `${capital(plain(fault.name))} ${way} `, h("small", {}, prose(fault.parameter))), change(side.detectable), change(named(side)), change(side.bound), side.nearest || DASH]),
+        sides.map(([fault, way, side]) => [h("span", {}, `${capital(translate(plain(fault.name)))} ${translate(way)} `, h("small", {}, prose(fault.parameter))), change(side.detectable), change(named(side)), change(side.bound), side.nearest || DASH]),
       ),
     ),
     section("How sure a size becomes", "Cramér-Rao bound, with the healthy parameters as well known as they are.", picture("Standard deviation of the size over time", (c) => sizes(c, faults))),
     section(
       "When the loop fails",
       "Tracking lost: its bandwidth falls to 0.7 of the healthy one. Stability lost: its distance to instability is halved. Such a size is a limit for the trend of an asset.",
-      table("Limits of faults", ["Change, as a ratio to healthy", "*Tracking lost at", "*Stability lost at"], sides.map(([fault, way, side]) => [`${capital(plain(fault.name))} ${way}`, ...[side.tracking, side.stability].map((at) => (at ? general(at) : "never"))])),
+      table("Limits of faults", ["Change, as a ratio to healthy", "*Tracking lost at", "*Stability lost at"], sides.map(([fault, way, side]) => [`${capital(translate(plain(fault.name)))} ${translate(way)}`, ...[side.tracking, side.stability].map((at) => (at ? general(at) : "never"))])),
     ),
     names.length > 1 && section("How alike they look", "Cosine between what small changes do: 1 or −1 cannot be told apart, 0 is as different as can be.", table("Cosines between faults", ["Change", ...names.map((name) => `*${plain(name)}`)], names.map((one) => [plain(one), ...names.map((other) => heat(study.cosines[one][other]))]))),
     study.mimics?.length > 0 && section("What else it could be", "Changes that are no fault of the list, the fault that each looks like, and from where on they are told apart.", table("Mimics", ["Change", "Is most like", "*Cosine", "*So much", "*Looks like", "*Told apart from"], study.mimics.map((one) => [h("span", {}, one.words, !/ |^delay$/.test(one.name) && h("small", {}, " ", prose(one.name))), one.imitates, number(one.cosines[one.imitates], 3), amount(one.amount, one.unit), change(one.looks_like), amount(one.told_apart, one.unit)]))),

@@ -32,7 +32,7 @@ export async function show(main, { signal, part: id, entitle }) {
       h("h1", {}, "Diagnosis of ", where),
       h("span", { class: "note" }, [moment(found.t), found.grounds, found.who && `by ${found.who}`].filter(Boolean).join(", ")),
       h("span", { class: "gap" }),
-      h("div", { class: "actions" }, again && h("a", { class: "button", href: again }, "Diagnose again"), h("button", { type: "button", onclick: () => print() }, "Print"), found.report && h("a", { class: "button", href: found.report, target: "_blank", rel: "noopener" }, "Report as one file")),
+      h("div", { class: "actions" }, found.asset && h("a", { class: "button", href: query("/alarms", { asset: found.asset }) }, "Its alarms"), again && h("a", { class: "button", href: again }, "Diagnose again"), h("button", { type: "button", onclick: () => print() }, "Print"), found.report && h("a", { class: "button", href: found.report, target: "_blank", rel: "noopener" }, "Report as one file")),
     ),
     found.sections.length ? verdict(found.verdict, found.sections) : h("p", { class: "summary" }, prose(found.summary)),
     ...evidence(found.sections, pictures),

@@ -3,11 +3,26 @@ import { get } from "./api.js";
 import { h, mark as set, translate, tell } from "./dom.js";
 import { follow } from "./live.js";
 import { mark, say, VERDICTS } from "./marks.js";
-import { DASH, duration, moment, multiple, plain, recent, sentence, signed, size } from "./words.js";
+import { DASH, duration, moment, multiple, plain, sentence, signed, size } from "./words.js";
 
 const STALE_S = 10; // without a sample for so long, the age is told
 const ORDER_MS = 5000; // between two changes of the order: rows must not run away from whoever reads them
-const COLUMNS = ["State", "Asset", "Group", "What is known", "Since", "T² / limit", "CUSUM / limit", "Deviation", "Growth / week", "Limit in", "Data", "Alarms", "Sample"];
+// Name, width, and the rows that have something in it, if it goes where no row has.
+const COLUMNS = [
+  ["State", "7.2rem"],
+  ["Asset", "minmax(5rem, 9rem)"],
+  ["Group", "minmax(3.6rem, 6.5rem)", (row) => row.group],
+  ["What is known", "minmax(12rem, 1fr)"],
+  ["Lasting", "4.2rem"],
+  ["Distance / limit", "7rem"],
+  ["Deviation", "4.6rem", (row) => row.deviation !== null],
+  ["Growth / week", "5.8rem", (row) => row.outlook?.rate_per_day],
+  ["Limit in", "6.6rem", (row) => row.outlook],
+  ["Data", "minmax(3.4rem, 7rem)"],
+  ["Alarms", "5.4rem", (row) => row.alarms.length],
+  ["Sample", "4.4rem"],
+];
+const NUMERIC = ["Lasting", "Distance / limit", "Deviation", "Growth / week", "Limit in", "Sample"];
 // Steps of urgency: what the statistics do below their limits moves no row.
 const rank = (row) => 2 * Math.floor(row.severity / 4) + (row.severity % 4 >= 1 ? 1 : 0);
 const WEEK = 7;
@@ -33,8 +48,7 @@ export async function show(main, { signal, linked, values }) {
   const filter = { verdict: values.get("verdict") ?? "", search: values.get("search") ?? "", group: values.get("group") ?? "", order: values.get("order") ?? "worst", source: values.get("source") ?? "", question: values.get("show") ?? "" };
   const map = h("div", { class: "map" });
   const body = h("div", { role: "rowgroup", class: "rows" });
-  const none = h("p", { class: "empty" }, "Loading");
-  const first = h("p", { class: "empty", hidden: true }, h("a", { href: "/begin" }, "Begin with a log"), ". ", "The log of a healthy machine becomes settings and a baseline. `servoscope add` writes the machine into a service file, and `servoscope run` follows it.");
+  const none = h("div", { class: "empty" }, "Loading");
   const counts = filters();
   const sources = overview((name) => ((filter.source = filter.source === name ? "" : name), chosen(), recount()));
   const search = h("input", { type: "search", placeholder: "Search", "aria-label": "Search assets", value: filter.search });
@@ -42,18 +56,21 @@ export async function show(main, { signal, linked, values }) {
   const orders = h("select", { "aria-label": "Order" }, Object.entries(ORDERS).map(([key, [words]]) => h("option", { value: key }, words)));
   orders.value = filter.order in ORDERS ? filter.order : "worst";
   const grid = h("div", { class: "grid fleet", tabindex: "0", role: "table", "aria-label": "Assets, worst first" });
-  let now = 0;
+  let [now, configured] = [0, 0];
+  // A phone shows machines first, and the rest when it is asked for.
+  const unfold = () => set(sheet, "aria-expanded", String(main.classList.toggle("unfolded")));
+  const sheet = h("button", { type: "button", class: "filter sheet", "aria-expanded": "false", onclick: unfold }, "Filters and map");
+  main.classList.add("fleet-page");
 
   main.replaceChildren(
-    h("div", { class: "head" }, h("h1", {}, "Fleet"), counts.element, h("span", { class: "gap" }), orders, groups, search),
+    h("div", { class: "head" }, h("h1", {}, "Fleet"), counts.element, h("span", { class: "gap" }), orders, groups, search, sheet),
     sources.element,
     map,
     grid,
     none,
-    first,
   );
   grid.append(
-    h("div", { role: "rowgroup" }, h("div", { role: "row", class: "line titles" }, COLUMNS.map((name, i) => h("span", { role: "columnheader", class: ((i > 4 && i < 10) || i === 12) && "n" }, name)))),
+    h("div", { role: "rowgroup" }, h("div", { role: "row", class: "line titles" }, COLUMNS.map(([name]) => h("span", { role: "columnheader", class: NUMERIC.includes(name) && "n" }, name)))),
     body,
   );
   orders.addEventListener("change", () => ((filter.order = orders.value), chosen(), order(true)));
@@ -109,8 +126,10 @@ export async function show(main, { signal, linked, values }) {
   function sift() {
     const shown = [...assets.values()].filter(showIfWanted);
     none.hidden = shown.length > 0;
-    first.hidden = assets.size > 0;
-    tell(none, assets.size ? "No asset is like this." : "No machine yet.");
+    grid.hidden = !assets.size;
+    if (assets.size) tell(none, "No asset is like this.");
+    else if (configured) tell(none, `${configured} assets are configured, waiting for the first samples.`);
+    else none.replaceChildren(beginning());
   }
 
   function chosen() {
@@ -180,11 +199,23 @@ export async function show(main, { signal, linked, values }) {
       order(true);
     }
     recount();
+    fold();
     sift();
+  }
+
+  // What is empty for all takes no room.
+  function fold() {
+    const rows = [...assets.values()].map((one) => one.row);
+    const empty = COLUMNS.map(([, , holds]) => Boolean(holds) && !rows.some(holds));
+    if (grid.dataset.empty === String(empty)) return;
+    grid.dataset.empty = String(empty);
+    empty.forEach((gone, i) => grid.classList.toggle(`without-${i}`, gone));
+    grid.style.setProperty("--columns", COLUMNS.filter((_, i) => !empty[i]).map(([, width]) => width).join(" "));
   }
 
   const first = await get("/assets", signal);
   now = first.now;
+  configured = first.configured;
   take(first.assets);
   chosen();
   follow(
@@ -257,10 +288,29 @@ function limitIn(row, now) {
   return left[1] === Infinity ? `from ${duration(left[0])}` : `${duration(left[0])} – ${duration(left[1])}`;
 }
 
-// What is known, without the verdict, which stands beside it.
+// What is known, without the verdict, which stands beside it: numbers first, as what is long is cut off at its end.
 function known(row) {
-  const named = (row.sizes ?? []).map((one) => `${one.words.replace(/ \(.*/, "")}, ${one.parameter} ${size({ ...one, interval: [one.low, one.high] })[0]}`);
-  return row.verdict === "fault" && named.length ? named.join("; ") : withoutVerdict(sentence(row.summary));
+  if (row.verdict !== "fault" || !row.sizes?.length) return withoutVerdict(sentence(row.summary));
+  const sizes = row.sizes.map((one) => `${one.parameter} ${size({ ...one, interval: [one.low, one.high] })[0]}`);
+  return `${sizes.join(", ")}: ${row.sizes.map((one) => translate(one.words).replace(/ \(.*/, "")).join("; ")}`;
+}
+
+// The first steps of somebody who follows nothing yet.
+function beginning() {
+  const step = (words, address, link) => h("li", {}, words, " ", address ? h("a", { href: address }, link) : h("code", { translate: "no" }, link));
+  return h(
+    "section",
+    {},
+    h("h2", {}, "Add a machine"),
+    h(
+      "ol",
+      { class: "why" },
+      step("Drop a log of the healthy machine, and get the settings of its loop:", "/begin", "Begin with a log"),
+      step("Learn from healthy recordings what the loop looks like:", "/learn", "Learn a baseline"),
+      step("Name the baseline and the source of the samples in a service file, and follow them:", null, "servoscope run hall.toml"),
+    ),
+    h("p", {}, "No assets yet: `servoscope run` follows them, and writes what it finds to this store."),
+  );
 }
 
 function withoutVerdict(words) {
@@ -279,11 +329,10 @@ function lineOf(first) {
   const cell = (kind = "") => h("span", { role: "cell", class: kind });
   const name = h("a", { href: `/assets/${encodeURIComponent(first.asset)}`, translate: "no" }, first.asset);
   const state = cell("state");
-  const [group, what, since, deviation, growth, limit, data, alarms, last] = [cell(), cell("what"), cell(), cell("n"), cell("n"), cell("n"), cell(), cell(), cell("n")];
-  const statistic = gauge();
-  const level = gauge();
-  const element = h("div", { role: "row", class: "line" }, state, h("span", { role: "cell", class: "name" }, name), group, what, since, statistic.element, level.element, deviation, growth, limit, data, alarms, last);
-  [...element.children].forEach((one, i) => set(one, "data-name", COLUMNS[i]));
+  const [group, what, lasting, deviation, growth, limit, data, alarms, last] = [cell(), cell("what"), cell("n"), cell("n"), cell("n"), cell("n"), cell(), cell(), cell("n")];
+  const distance = gauge();
+  const element = h("div", { role: "row", class: "line" }, state, h("span", { role: "cell", class: "name" }, name), group, what, lasting, distance.element, deviation, growth, limit, data, alarms, last);
+  [...element.children].forEach((one, i) => set(one, "data-name", COLUMNS[i][0]));
   const drawn = (one, value) => {
     tell(one.value, multiple(value));
     const share = Math.round(Math.min((value ?? 0) / 1.5, 1) * 48); // px; the limit is at 32
@@ -305,10 +354,9 @@ function lineOf(first) {
     say(what, told);
     set(what, "title", told);
     const from = row.verdict === "fault" ? (row.onset ?? row.since) : row.since;
-    tell(since, recent(from, now));
-    set(since, "title", moment(from));
-    drawn(statistic, row.statistic);
-    drawn(level, row.level);
+    tell(lasting, duration(Math.max(row.t - from, 0)));
+    set(lasting, "title", moment(from));
+    drawn(distance, row.statistic === null ? null : Math.max(row.statistic, row.level ?? 0));
     tell(deviation, row.deviation === null ? DASH : `${(100 * row.deviation).toFixed(1)} %`);
     tell(growth, row.outlook?.rate_per_day ? `${signed(100 * WEEK * row.outlook.rate_per_day[1], 2)} %` : DASH);
     tell(limit, limitIn(row, row.t));

@@ -13,6 +13,7 @@ const WEEK = 7;
 
 export function growth(path, name, asset, { session, values, signal }) {
   const canvas = h("div", { class: "plot tall" });
+  const picture = h("div", { hidden: true }, canvas);
   const said = h("p", { class: "summary", role: "status" });
   const why = h("p", { class: "note" });
   const which = h("select", { "aria-label": "What is followed" });
@@ -20,7 +21,7 @@ export function growth(path, name, asset, { session, values, signal }) {
   const buttons = Object.keys(SPANS).map((words) => h("button", { type: "button", class: "filter", "aria-pressed": "false", onclick: () => chosen(words) }, words));
   const advised = h("p", { class: "note" });
   const noted = h("ul", { class: "why" });
-  const element = titled("How it grows", [which, limit, ...buttons], said, advised, canvas, why, noted, mayChange(session.role, "operator") && noting());
+  const element = titled("How it grows", [which, limit, ...buttons], said, advised, picture, why, noted, mayChange(session.role, "operator") && noting());
   let span = SPANS[values.get("span")] === undefined ? "60 d" : values.get("span");
   let [curves, forecast, notes, limits] = [[], null, [], []];
   const chart = plot(canvas, "Size over time, with its 95 % interval", (c) => drawn(c, shown()), signal, { csv: table });
@@ -92,7 +93,7 @@ export function growth(path, name, asset, { session, values, signal }) {
       limit: goal,
       forecast: reach ? { t: forecast.to_t, value: percent(forecast.value[1]), ends } : null,
       marks: notes.map((note) => [note.t, note.text]),
-      range: [SPANS[span] === null ? null : asset().t - SPANS[span], until],
+      range: [all[0]?.t ?? null, until], // where there are values, not the whole span
     };
   }
 
@@ -113,7 +114,7 @@ export function growth(path, name, asset, { session, values, signal }) {
     const from = SPANS[span] === null ? null : asset().t - SPANS[span];
     const found = await Promise.all(["faults", "coefficients"].map((of) => get(query(`${path}/sizes`, { of, from, points: 600 }), signal)));
     notes = (await get(`${path}/notes`, signal)).notes;
-    noted.replaceChildren(...notes.map((note) => h("li", {}, `${moment(note.t, { seconds: false })}: ${note.text} (${note.who})${note.anew ? "; the trend begins here" : ""}`)));
+    noted.replaceChildren(...notes.map((note) => h("li", {}, h("span", { translate: "no" }, `${moment(note.t, { seconds: false })}: ${note.text} (${note.who})`), note.anew && "; the trend begins here")));
     curves = found.flatMap((one) => one.curves);
     const names = [...new Set(curves.map((curve) => curve.name))];
     if (String(names) !== [...which.options].map((one) => one.value).join()) {
@@ -145,7 +146,8 @@ export function growth(path, name, asset, { session, values, signal }) {
     }
     say(said, words(forecast, limit.value !== ""));
     tell(why, last ? `${count(all.length)} values are shown, the last one of ${moment(last.t)}; ${forecast.explanation.join(" ")}` : "");
-    chart.draw();
+    picture.hidden = !last; // where there are no values there is no chart
+    if (last) chart.draw();
   }
 
   const known = get(`${path}/limits`, signal).then((found) => ((limits = found.limits), advise(rows().at(-1))));

@@ -83,7 +83,7 @@ export async function show(main, { session, signal, values }) {
   );
   work.append(
     section("Loop", ["What is known of it: sampling, plant, controller. A baseline has it inside. Without a loop file ", h("a", { href: "/begin" }, "begin with a log"), "."], loop.element),
-    section("Healthy recordings", "Several of different days and temperatures make a baseline that knows its own scatter.", dropzone("Drop healthy recordings here", true, add, signal), (await earlier(add, signal)) ?? "", listed, columns, machines.element, h("div", { class: "actions" }, learn, look, said)),
+    section("Healthy recordings", "Take several days and temperatures: then the baseline includes their scatter.", dropzone("Drop healthy recordings here", true, add, signal), (await earlier(add, signal)) ?? "", listed, columns, machines.element, h("div", { class: "actions" }, learn, look, said)),
     result,
   );
   for (const id of values.getAll("upload")) await get(`/uploads/${part(id)}`, signal).then(add, () => {}); // those that are still there
@@ -147,7 +147,7 @@ function likes() {
     "details",
     { hidden: true },
     h("summary", {}, "A new machine among like ones"),
-    h("p", { class: "note" }, "Choose the baselines of five or more like machines: what they have in common need not be learned again, and its own recordings make it sharper."),
+    h("p", { class: "note" }, "Choose the baselines of five or more like machines: they are a prior, which its own recordings refine."),
     listed,
   );
   const list = (all) => {

@@ -98,7 +98,7 @@ export function mapping(one, loopless = false) {
     }
     if (!typed.has("segment")) segment.value = (found.segment ?? []).join(", ");
     if (!typed.has("time_unit")) unit.value = found.time_unit ?? "";
-    tell(origin, own ? "As the loop file says." : fit ? "As the loop says." : "Guessed from the names: look whether this is so.");
+    tell(origin, own ? "As the loop file says." : fit ? "As the loop says." : "Guessed from the names: please check.");
   };
   suit(null);
   const read = () => {

@@ -132,13 +132,6 @@ export function moment(t, { seconds = true, fraction = 0 } = {}) {
   return `${day} ${pad(at.getHours())}:${pad(at.getMinutes())}${seconds ? `:${pad(at.getSeconds())}${rest}` : ""}`;
 }
 
-// The same, as short as it can be told at a time `now`: today's without the day, this year's without the year.
-export function recent(t, now) {
-  const [then, today] = [moment(t), moment(now)];
-  if (then.slice(0, 10) === today.slice(0, 10)) return then.slice(11);
-  return then.slice(0, 4) === today.slice(0, 4) ? then.slice(5, 16) : then.slice(0, 10);
-}
-
 export function duration(seconds) {
   if (seconds === null || seconds === undefined || !Number.isFinite(seconds)) return DASH;
   if (seconds < 0) return "0 s";

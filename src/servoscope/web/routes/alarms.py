@@ -17,7 +17,7 @@ from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
 from servoscope.web.schemas import assets as schemas
 from servoscope.web.schemas.checks import FaultCheck
 from servoscope.web.schemas.requests import AssetQuery, AuditQuery, CommandName, CommandRequest, TransitionQuery
-from servoscope.web.schemas.responses import AuditEntry, AuditList
+from servoscope.web.schemas.responses import AuditEntry, AuditList, DiagnosisRow
 from servoscope.web.statuses import read_statuses, service_statuses
 from servoscope.web.stored_diagnosis import stored_headline
 
@@ -45,8 +45,8 @@ def _with_advice(context: Context, row: schemas.AlarmRow, status: AssetStatus | 
     """Return an alarm with what the service file says of it; of a fault with what to check, and since when."""
     definition = context.config.alarms.definitions.get(alarm_kind(row.alarm)) if context.config is not None else None
     known, checks = dict(row), list[FaultCheck]()
+    full = last_full_diagnosis(context, row.asset) if row.alarm == FAULT_ALARM else None
     if row.alarm == FAULT_ALARM and isinstance(status, AssetStatus):
-        full = last_full_diagnosis(context, row.asset)
         checks = asset_checks(context, row.asset, status, full)
         if full is not None:
             known["cause"] = stored_headline(full)
@@ -58,6 +58,7 @@ def _with_advice(context: Context, row: schemas.AlarmRow, status: AssetStatus | 
         operator_action=definition.operator_action if definition is not None else None,
         response_time_s=definition.response_time_s if definition is not None else None,
         checks=checks,
+        diagnosis=DiagnosisRow.from_stored(full) if full is not None else None,
     )
 
 

@@ -75,6 +75,7 @@ def list_assets(context: ContextDep, query: Annotated[FleetQuery, Query()]) -> s
     ]
     return schemas.FleetStatus(
         now=time.time(),
+        configured=len(context.config.assets) if context.config is not None else 0,
         assets=sorted(wanted, key=lambda row: (-row.severity, row.asset)),
         groups=sorted({row.group for row in rows if row.group}),
         services=[schemas.ServiceRow.from_status(one.name, status) for one, status in service_statuses(statuses)],

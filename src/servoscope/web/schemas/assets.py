@@ -54,6 +54,7 @@ class AlarmDetail(AlarmRow):
     operator_action: str | None
     response_time_s: float | None
     checks: list[FaultCheck]
+    diagnosis: DiagnosisRow | None
 
 
 class AlarmList(ApiResponse):
@@ -180,9 +181,10 @@ class ServiceRow(ApiResponse):
 
 
 class FleetStatus(ApiResponse):
-    """All assets, the most urgent first."""
+    """All assets, the most urgent first; `configured`: how many the service file has."""
 
     now: float
+    configured: int
     assets: list[AssetRow]
     groups: list[str]
     services: list[ServiceRow]

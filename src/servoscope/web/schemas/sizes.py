@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from servoscope.core.messages import MessageField
 from servoscope.design.operating_limits import OperatingLimit
 from servoscope.prognosis.forecast import Prognosis
+from servoscope.web.schemas.requests import NoteRequest
 from servoscope.web.schemas.responses import ApiResponse
 
 
@@ -31,13 +32,12 @@ class SizeHistory(ApiResponse):
     curves: list[SizeCurve]
 
 
-class Note(ApiResponse):
-    """What somebody noted about an asset; `anew`: its trend begins there."""
+class Note(NoteRequest, ApiResponse):
+    """What somebody noted about an asset."""
+
+    model_config = ConfigDict(extra="ignore")  # of later versions
 
     who: str
-    t: float
-    text: str
-    anew: bool
 
 
 class NoteList(ApiResponse):
