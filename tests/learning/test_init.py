@@ -8,8 +8,11 @@ import pytest
 from commands import one_line, run
 from logs import GERMAN_RATE, german_axis
 
+import servoscope as ss
+from servoscope.learning import proposal
 from servoscope.models.loop import Loop
 from servoscope.models.plants.axis import AxisPlant
+from servoscope.signals.readers import csv
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +60,15 @@ def test_several_logs_and_folders_are_one_machine(log: Path, tmp_path: Path) -> 
     assert told.out.count("Usable") == 2
     assert "monday.csv" in told.out and "tuesday.csv -o baseline.json" in " ".join(told.out.split())
     assert Loop.load(target).plant.kind == "axis"
+
+
+def test_of_a_long_log_a_part_is_looked_at(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not [note for note in ss.init(log).notes if note.key == "init.part"]
+    monkeypatch.setattr(proposal, "PART_ROWS", 2000)
+    monkeypatch.setattr(csv, "CHUNK_BYTES", 1 << 14)
+    proposed = ss.init(log)
+    (note,) = [note for note in proposed.notes if note.key == "init.part"]
+    assert 2000 <= note.values["rows"] < 4000 and proposed.loop.sample_rate == pytest.approx(GERMAN_RATE)
 
 
 def test_what_may_be_a_covariate_is_mentioned(log: Path, tmp_path: Path) -> None:

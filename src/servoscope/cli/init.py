@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from servoscope.models.loop import Columns
 
 MAX_LISTED_PLANTS = 6
-PART_ROWS = 1_000_000  # of each log that are looked at
 
 
 @app.command()
@@ -41,7 +40,7 @@ def init(
 
     from servoscope.cli.render import results
     from servoscope.core.errors import OutputError, ServoscopeError
-    from servoscope.learning.proposal import propose_columns
+    from servoscope.learning.proposal import PART_ROWS, propose_columns
     from servoscope.report.page import say
     from servoscope.signals import readers
     from servoscope.signals.readers.axes import find_axes

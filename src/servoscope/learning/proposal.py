@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,10 +36,11 @@ from servoscope.signals.readers.guess_columns import (
     quoted_channel,
 )
 from servoscope.signals.readers.select import RowFilter
-from servoscope.signals.readers.table import TableFile, number_column
+from servoscope.signals.readers.table import TableFile, number_column, read_part
 from servoscope.signals.readers.units import split_unit
 from servoscope.signals.readers.wrap import find_wrap
 
+PART_ROWS = 400_000  # of a log, that are looked at; more are read in whole chunks
 MEMORIES = 10.0  # that a recording to learn from should have at least
 MAX_MEMORY_S, MIN_PERIODS = 5.0, 5.0  # of the estimator; periods of the cutoff that it holds at least
 JITTER_PERCENT = 5.0  # of a sample: standard deviation of the steps above which rows are resampled
@@ -300,9 +301,12 @@ def init(
     200.0
     """
     paths = [Path(path)] if isinstance(path, str | Path) else [Path(log) for log in path]
-    if not isinstance(columns, Columns):
-        columns = propose_columns(paths[0], list_channels(paths[0]), given=columns)
-    return propose_loop(paths, columns, where)
+    with read_part(PART_ROWS) as part:
+        if not isinstance(columns, Columns):
+            columns = propose_columns(paths[0], list_channels(paths[0]), given=columns)
+        proposal = propose_loop(paths, columns, where)
+    cut = (message("init.part", log=name, rows=rows) for name, rows in part.cut.items())
+    return replace(proposal, notes=(*proposal.notes, *cut))
 
 
 def _unwrapped_columns(

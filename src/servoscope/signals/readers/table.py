@@ -243,14 +243,14 @@ class TableFile:
         rows, also = 0, {alias: name for alias, name in self.aliases.items() if alias in wanted}
         places = {*wanted, *also.values()}
         for table in self.read_chunks([name for name in self.columns if name in places], texts):
+            if part is not None and rows >= part.rows:
+                part.cut[self.name] = rows
+                break
             rows += table.rows
             if table.rows and also:
                 table = replace(table, columns={**table.columns, **{a: table.columns[n] for a, n in also.items()}})
             if table.rows:
                 yield table
-            if part is not None and rows >= part.rows:
-                part.cut[self.name] = rows
-                break
         if not rows:
             raise EmptyRecordingError(f"{self.path}: holds no rows")
 
