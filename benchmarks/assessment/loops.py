@@ -14,20 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from servoscope.assessment.posterior import CAUSES
+
 Floats = npt.NDArray[np.float64]
 
-CAUSES = (
-    "stiction",
-    "backlash",
-    "too tight",
-    "too sluggish",
-    "oscillation from outside",
-    "saturation",
-    "quantisation",
-    "frozen sensor",
-    "manual",
-    "good",
-)
 STEPS = 8  # of integration within one sample
 WARM_UP = 300  # samples before the log begins
 LENGTHS = (600, 750, 1000, 1500, 2500)

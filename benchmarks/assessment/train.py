@@ -5,14 +5,18 @@ python benchmarks/assessment/train.py [--data ../shared/data]
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from records import Records, measured, servos, simulated
+from scipy import optimize, special
 
 from servoscope.assessment import posterior
-from servoscope.assessment.posterior import PENALTY, CausePosterior
+from servoscope.assessment.posterior import CausePosterior, expand_features
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tables import parse_with_data, parser
@@ -21,6 +25,43 @@ SIMULATED, SEED = 1200, 2
 LOOP_WEIGHT = 8.0  # what one measured loop counts, in simulated ones; its logs share it
 BACKLASH_WEIGHT = 0.5  # valves stick more often than they have play
 SERVO_WEIGHT = 20.0  # the same of all servo recordings in a folder
+PENALTY = 1.5e-3  # on squared weights, per record
+
+Floats = npt.NDArray[np.float64]
+
+
+def fit_posterior(
+    names: tuple[str, ...], features: Floats, possible: npt.NDArray[np.bool_], weights: Floats, penalty: float
+) -> CausePosterior:
+    """Fit to records of which the possible causes are known, (N, causes); weights: of each record, (N,).
+
+    A record with several possible causes counts with the sum of their probabilities.
+    """
+    mean, std = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-9)
+    rows = expand_features(features, mean, std)
+    shape = rows.shape[1], possible.shape[1]
+    excluded = np.where(possible, 0.0, -np.inf)
+    scale = penalty * weights.sum()
+
+    def objective(flat: Floats) -> tuple[float, Floats]:
+        w = flat.reshape(shape)
+        logits = rows @ w
+        all_causes, known = special.logsumexp(logits, axis=1), special.logsumexp(logits + excluded, axis=1)
+        share = np.exp(logits - all_causes[:, None]) - np.exp(logits + excluded - known[:, None])
+        gradient = rows.T @ (weights[:, None] * share)
+        gradient[:-1] += 2.0 * scale * w[:-1]
+        return float(weights @ (all_causes - known) + scale * np.square(w[:-1]).sum()), gradient.ravel()
+
+    found = optimize.minimize(objective, np.zeros(shape).ravel(), jac=True, method="L-BFGS-B", options={"maxiter": 250})
+    return CausePosterior(names, mean, std, found.x.reshape(shape))
+
+
+def to_json(fitted: CausePosterior) -> str:
+    """Return a posterior as JSON; numbers to 6 digits."""
+    plain: dict[str, Any] = {"names": fitted.names}
+    for name in ("mean", "std", "weights"):
+        plain[name] = [float(f"{x:.6g}") for x in getattr(fitted, name).ravel()]
+    return json.dumps(plain) + "\n"
 
 
 def fit(training: Records, real: Records, servo: Records, left_out: str = "") -> CausePosterior:
@@ -38,7 +79,7 @@ def fit(training: Records, real: Records, servo: Records, left_out: str = "") ->
         possible.append(records.possible[kept])
         weights.append(np.array([share[str(loop)] for loop in records.loops[kept]]))
     stacked = np.vstack(features), np.vstack(possible), np.concatenate(weights)
-    return CausePosterior.fit(training.names, *stacked, PENALTY)
+    return fit_posterior(training.names, *stacked, PENALTY)
 
 
 def main() -> None:
@@ -46,7 +87,7 @@ def main() -> None:
     given = parse_with_data(parser(__doc__), "real/process_loops")
     real, servo = measured(given.data / "real" / "process_loops"), servos(given.data / "real")
     target = Path(posterior.__file__).with_name("posterior.json")
-    target.write_text(fit(simulated(SIMULATED, SEED, "training"), real, servo).to_json(), encoding="utf-8")
+    target.write_text(to_json(fit(simulated(SIMULATED, SEED, "training"), real, servo)), encoding="utf-8")
 
 
 if __name__ == "__main__":

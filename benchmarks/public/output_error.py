@@ -4,17 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
+from servoscope.core.jit.array_function import ArrayFunction
+from servoscope.core.jit.arrays import Variable
 from servoscope.isolation.ml.window import delay_input, plant_input
 from servoscope.models.loop import Loop
 from servoscope.models.plants.axis import AxisPlant
 from servoscope.signals import Recording
+from servoscope.simulation.linear_kernels import AxisConstants, advance_axis, axis_constants
 
 SPEED_OVER = 2  # samples of the central difference that gives the speed at the start
 MOST_STEPS = 60
+
+
+@ArrayFunction
+def run_free_axis(
+    printer: Any, motion: AxisConstants, position: Any, speed: Any, u: Any, y: Any, *, order: int
+) -> None:
+    """Run the first axis driven by what acts on it, u (N,), from a position and a speed on; y (N,) is filled."""
+    at, v = Variable(printer, position), Variable(printer, speed)
+    for k in printer.loop(0, u.shape[0]):
+        y[k] = v.value if motion.speed else at.value
+        for _ in printer.loop(0, motion.steps):
+            advance_axis(printer, motion, 0, at, v, motion.gain[0] * u[k], order)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +67,6 @@ def simulate_free(
     speed
         Speed at the first sample [output per s]; a central difference of the measured y if None.
     """
-    from servoscope.simulation.linear_kernels import axis_constants, run_free_axis
-
     plant = plant or loop.plant  # type: ignore[assignment]
     assert isinstance(plant, AxisPlant)
     N, rate = recording.samples, recording.sample_rate

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 import string
 import subprocess
@@ -10,14 +11,22 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 import servoscope as ss
 from golden.results import FOLDER
+from servoscope import report
+from servoscope.cli.render import results
+from servoscope.cli.render.diagnosis import print_diagnosis
 from servoscope.core import messages
 from servoscope.core.messages import catalogue, languages, message, render, translate
+from servoscope.diagnosis.diagnose import diagnose_with_trace
+from servoscope.learning.inspection import inspect
 from servoscope.models import plants
 from servoscope.models.plants import axis
+from servoscope.report.inspection_page import render_inspection_page
 
+OPEN, CLOSE = "\N{MATHEMATICAL LEFT WHITE SQUARE BRACKET}", "\N{MATHEMATICAL RIGHT WHITE SQUARE BRACKET}"
 OTHERS = [name for name in languages() if name != "en"]
 # English words that no text of another language has; symbols, file names and settings are English everywhere
 ENGLISH = r"\b(the|and|with|from|recording|healthy|fault|reference|output|estimate|size|probability|since|none|of)\b"
@@ -75,6 +84,56 @@ def test_the_pages_write_no_sentence_that_the_catalogue_lacks(language: str) -> 
     written = [(path.name, words) for path in pages for words in written_sentences(path.read_text(encoding="utf-8"))]
     assert len(written) > 200
     assert [(name, words) for name, words in written if not is_known(words)] == []
+
+
+def outside_of_messages(text: str) -> str:
+    """What of a text in the marked language no message and no word of the catalogue says."""
+    depth, left = 0, list[str]()
+    for letter in text:
+        depth += (letter == OPEN) - (letter == CLOSE)
+        left.append(letter if depth == 0 else " ")
+    return "".join(left)
+
+
+def test_no_sentence_is_left_outside_of_the_catalogue(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports and terminal, in a language made of the keys: each message and each word stands between marks."""
+    english = {key: text.replace("|", f"{CLOSE}|{OPEN}") if key.startswith("count.") else text
+               for key, text in catalogue("en").items()}  # fmt: skip
+    words = {key: key.partition(".")[2] for key in catalogue("de") if key.startswith("word.")}
+    marked = {key: f"{OPEN}{text}{CLOSE}" for key, text in {**english, **words}.items()}
+    monkeypatch.setattr(
+        messages, "catalogue", lambda language="en": marked if language == "zz" else catalogue(language)
+    )
+    monkeypatch.setattr(messages, "LANGUAGE", "zz")
+    baseline = ss.Baseline.load(FOLDER / "rig.json")
+    baseline = baseline.model_copy(update={"notes": ()})  # kept as they were written
+    terminal, pages = io.StringIO(), list[str]()
+    console = Console(file=terminal, width=200)
+    results.print_baseline(console, baseline)
+    for name in ("healthy", "suspect"):
+        recording = ss.read(FOLDER / f"{name}.parquet", baseline.loop)
+        diagnosis, trace = diagnose_with_trace(baseline, recording)
+        print_diagnosis(console, diagnosis, details=True)
+        pages.append(report.render_diagnosis_page(diagnosis, trace, recording, baseline.loop, {}))
+        inspection = inspect(recording, baseline.loop)
+        results.print_inspection(console, inspection)
+        pages.append(render_inspection_page(inspection, recording))
+    settings = f"<style>.*?</style>|<svg.*?</svg>|<h2>{OPEN}Settings{CLOSE}</h2>.*?</section>|<[^>]*>"
+    text = terminal.getvalue() + re.sub(settings, " ", "".join(pages), flags=re.S)
+    data = {
+        "healthy.parquet",
+        "suspect.parquet",
+        "healthy",
+        "suspect",
+        "parquet",
+        "reference",
+        "rig",
+        "beta",
+        "theta",
+        "model",
+        "error",
+    }
+    assert set(re.findall(r"[a-z]{3,}", outside_of_messages(text))) - data == set()
 
 
 def visible(page: str) -> str:

@@ -127,7 +127,7 @@ class TestKernel:
         assert whitening_filter(model)[3] == warm
         assert level.max() == 2.0 and len(np.unique(crossed)) >= 3  # it alarms, falls silent, and alarms again
         if decides == "evaluation":  # columns and healthy residual come from a shadow of fewer states
-            assert len(test.A) < 16 and ours.level == pytest.approx(level, rel=0.1, abs=0.04)
+            assert len(test.shadow.A) < 16 and ours.level == pytest.approx(level, rel=0.1, abs=0.04)
             moved = ours.crossed != crossed
             assert moved.mean() < 0.02 and np.all(np.abs(ours.crossed - crossed)[moved] <= pipeline.every)
         else:

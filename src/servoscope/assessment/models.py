@@ -187,7 +187,6 @@ class Margins(NamedTuple):
     gain: float  # gain margin, at most 100
     peak: float  # of the sensitivity, at most 100
     explained: float  # share of the controller's steps that a PID law explains
-    static_gain: float  # of the process from u to y, |G(0)| within the record
 
 
 def estimate_margins(fit: ModelFit, e: FloatArray, u: FloatArray) -> Margins:
@@ -207,4 +206,4 @@ def estimate_margins(fit: ModelFit, e: FloatArray, u: FloatArray) -> Margins:
     crossings = np.flatnonzero((loop.imag[:-1] * loop.imag[1:] < 0.0) & (loop.real[:-1] < 0.0))
     strongest = max(float(np.max(-loop.real[crossings], initial=0.01)), -float(loop.real[-1]))  # L(pi) is real
     peak = float(np.max(1.0 / np.maximum(np.abs(1.0 + loop), 0.01)))
-    return Margins(min(1.0 / strongest, 100.0), peak, explained, float(abs(plant[0])))
+    return Margins(min(1.0 / strongest, 100.0), peak, explained)

@@ -191,11 +191,8 @@ class Expectation:
         """Return the expectation for the recording's first seconds only."""
         r, kept, restart = self.reference
         samples = min(round(seconds * self.pipeline.loop.sample_rate), len(kept))
-        return self.with_reference(ReferencePath(r[: int(kept[samples - 1]) + 1], kept[:samples], restart[:samples]))
-
-    def with_reference(self, reference: ReferencePath) -> Expectation:
-        """Return the expectation under another reference."""
-        return replace(self, reference=reference)
+        begin = ReferencePath(r[: int(kept[samples - 1]) + 1], kept[:samples], restart[:samples])
+        return replace(self, reference=begin)
 
     def healthy_path(self, plant: Plant, model_theta: FloatArray) -> FloatArray:
         """Return what a healthy loop would show at every evaluation, shape (K, n).

@@ -14,6 +14,7 @@ from servoscope.cli.exit import print_json
 from servoscope.cli.options import JsonOption, ReasonOption, UserOption
 from servoscope.cli.service import AssetOption, StoreArgument, check_assets, open_store
 from servoscope.core.errors import AlarmError
+from servoscope.core.messages import message
 
 alarms_app = typer.Typer(no_args_is_help=True, help="List alarms, and ask for what operators may do with them.")
 app.add_typer(alarms_app, name="alarms")
@@ -86,7 +87,7 @@ def send_command(
     while (outcome := opened.command_outcome(number)) is None and time.monotonic() < deadline:
         time.sleep(0.1)
     if outcome is None:
-        typer.echo(f"{asset}: {alarm}: asked for; servoscope run will carry it out when it runs")
+        typer.echo(f"{asset}: {alarm}: {message('cli.asked_for')}")
     elif not outcome.accepted:
         raise AlarmError(outcome.refusal)
     else:

@@ -84,7 +84,7 @@ def fleet(
     def run_batch() -> Fleet:
         """Run over what is in the lake."""
         from servoscope.cli.progress import show_count
-        from servoscope.core.workers import available_cores
+        from servoscope.estimation.kernel.threads import core_count
         from servoscope.fleet import Lake, Plan, run
         from servoscope.fleet.tasks import local
         from servoscope.models.loop import Loop
@@ -106,7 +106,7 @@ def fleet(
 
             carry = spark(session(master))
         else:
-            carry = local(jobs or available_cores())
+            carry = local(jobs or core_count())
         with show_count() as tell:
             return run(plan, carry, tell)
 

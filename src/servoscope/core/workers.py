@@ -331,8 +331,3 @@ def _read_tasks(parent: Connection, waiting: SimpleQueue[tuple[str, tuple[Any, .
         traceback.print_exc()
         os._exit(1)
     os._exit(0)
-
-
-def available_cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -73,9 +73,7 @@ def hypothesis_distances(scene: Scenario, fault: Fault, x: float) -> HypothesisD
 Span = tuple[float, float]
 
 
-def ambiguous_sizes(
-    scene: Scenario, fault: Fault, up: bool, progress: Callable[[], None] = lambda: None
-) -> tuple[Span, ...]:
+def ambiguous_sizes(scene: Scenario, fault: Fault, up: bool) -> tuple[Span, ...]:
     """Return at which sizes another single fault is more likely with a probability above `MISNAMED`.
 
     The spans of logarithms (positive) are in rising order. The first begins at 0; the last ends at infinity if the end
@@ -91,7 +89,6 @@ def ambiguous_sizes(
 
     def at(log_x: float) -> HypothesisDistances | None:
         if log_x not in known:
-            progress()
             try:
                 known[log_x] = hypothesis_distances(scene, fault, sign * float(np.exp(log_x)))
             except SimulationError:

@@ -8,7 +8,7 @@ that each cause and onset has its evidence in closed form.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -105,12 +105,10 @@ class ChangeTest:
         late = np.arange(len(A)) >= onset[:, None]
         effect[:, :, len(root) - self._drift.size :] += late[..., None] * drift[:, None]
         r = self._change_vector(g + np.einsum("kij,skj->ski", A, effect))
-        logs = np.array([np.logaddexp.reduce(each, axis=1) - np.log(each.shape[1]) for each in self._logs(r)])
+        factors = (term.log_factors(r) for term in self._terms)
+        logs = np.array([np.logaddexp.reduce(each, axis=1) - np.log(each.shape[1]) for each in factors])
         total = np.logaddexp.reduce(logs, axis=0) - np.log(len(logs))
         return float(np.quantile(total, 1.0 - share))
-
-    def _logs(self, r: FloatArray) -> Iterator[FloatArray]:
-        return (term.log_factors(r) for term in self._terms)
 
     def _change_vector(self, g: FloatArray) -> FloatArray:
         """Return what vectors (S, K, P + D) say of a change from each onset on, (S, onsets, D)."""

@@ -244,11 +244,7 @@ def build_cusum_constants(
         directions = np.zeros((0, 0))
         shadow = replace(columns, C=np.vstack([residual.C, columns.C]), D=np.vstack([residual.D, columns.D]))
     return CusumConstants(
-        A=shadow.A,
-        B=shadow.B,
-        C=np.ascontiguousarray(shadow.C),
-        D=np.ascontiguousarray(shadow.D),
-        X0=shadow.steady,
+        shadow=shadow,
         theta=theta,
         numerator=numerator,
         denominator=denominator,

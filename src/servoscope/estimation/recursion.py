@@ -101,11 +101,6 @@ def _offsets(sizes: dict[str, int]) -> dict[str, int]:
     return dict(zip((*sizes, "end"), ends, strict=True))
 
 
-def _shadow_system(test: CusumConstants, states: int, rows: int) -> LinearSystem:
-    """Return r -> [residual of the healthy loop, columns] of a sequential test, filled up with zeros."""
-    return pad_system(LinearSystem(test.A, test.B, test.C, test.D), states, rows)
-
-
 def _whitening_order(test: CusumConstants) -> int:
     """Return the order of the whitening filter, without coefficients that are zero but for rounding."""
     size = np.maximum(np.abs(test.numerator), np.abs(test.denominator))
@@ -280,10 +275,9 @@ def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
     tests = [c.watch for c in constants if c.watch is not None]
     n, rows = len(first.basis), len(first.bank.C)
     memory = max(map(_whitening_order, tests), default=0)
-    nxs, columns, count, q = (
-        max((len(getattr(test, name)) for test in tests), default=0) for name in ("A", "C", "limits", "directions")
-    )
-    shadows = [_shadow_system(test, nxs, columns) for test in tests]
+    lengths = [(len(x.shadow.A), len(x.shadow.C), len(x.limits), len(x.directions)) for x in tests]
+    nxs, columns, count, q = map(max, zip(*lengths, strict=True)) if tests else (0, 0, 0, 0)
+    shadows = [pad_system(test.shadow, nxs, columns) for test in tests]
     if q:
         shadows.append(pairs_structure(nxs, columns))  # like loops share machine code
     lags = max(len(c.a) for c in constants)
@@ -364,12 +358,12 @@ def _pack_constants(c: RecursionConstants, spec: KernelSpec) -> FloatArray:
         "tail": members,
     }
     if test is not None:
-        system = _shadow_system(test, spec.sizes.shadow, len(spec.shadow[0]))
+        system = pad_system(test.shadow, spec.sizes.shadow, len(spec.shadow[0]))
         filters = (pad(x[1 : 1 + memory], memory) for x in (test.numerator, test.denominator))
         values |= {
             "warm": test.warm,
             "shadow": pack_coefficients(spec.shadow, system),
-            "shadow_steady": test.X0[:, 0],
+            "shadow_steady": test.shadow.steady[:, 0],
             "apart": np.linalg.solve(c.basis, test.theta / c.scale) - c.theta,
             "white": np.concatenate([[test.gain], *filters]),
         }

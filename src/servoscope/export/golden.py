@@ -119,11 +119,6 @@ def judge(rows: FloatArray, limit: float, delays: tuple[int, int]) -> tuple[tupl
     return tuple(verdict.tolist()), (float(exceeding[-1]) if len(rows) else 0.0, float(since))
 
 
-def row_digest(row: npt.NDArray[Any]) -> int:
-    """Return FNV-1a, 64 bits, over the bits of numbers."""
-    return digest(row.astype(row.dtype.newbyteorder("<")).tobytes())
-
-
 def digest(numbers: Iterable[int]) -> int:
     """Return FNV-1a, 64 bits, over small numbers."""
     value = FNV_OFFSET
@@ -136,7 +131,7 @@ def golden_text(run: GoldenRun, prefix: str, image: bytes) -> str:
     """Return the header with the golden samples and results."""
     samples_of = np.ascontiguousarray(np.stack(run.signals, axis=1))
     bits = samples_of.view(np.dtype(f"u{samples_of.itemsize}"))
-    digests = [row_digest(row) for row in run.rows]
+    digests = [digest(row.astype(row.dtype.newbyteorder("<")).tobytes()) for row in run.rows]
     samples = ",\n".join("{" + ", ".join(f"0x{x:0{2 * bits.itemsize}X}u" for x in row) + "}" for row in bits.tolist())
     return "\n".join(
         [

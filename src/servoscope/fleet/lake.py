@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import unquote
 
 from servoscope.core.errors import RecordingError
@@ -70,11 +70,11 @@ class Lake:
             If there is no file, or no key for the asset.
         """
         is_table = where.lower().endswith(TABLES)
-        files: dict[tuple[str, str], list[tuple[str, str]]] = {}
+        files: dict[tuple[str, str], list[tuple[str, ...]]] = {}
         keys: dict[tuple[str, str], dict[str, str]] = {}
         for file in (_read_file_table if is_table else _walk_folders)(where, partition):
-            files.setdefault((file.asset, file.day), []).append((file.path, file.stamp))
-            keys.setdefault((file.asset, file.day), {}).update(file.groups)
+            files.setdefault(file.key, []).append((*file.files, file.stamp))
+            keys.setdefault(file.key, {}).update(file.groups)
         if not files:
             raise RecordingError(f"{where}: holds no Parquet file, give a folder with asset=.../day=... in it")
         items = []
@@ -115,17 +115,8 @@ def read_groups(path: Path) -> dict[str, dict[str, str]]:
     return {row[ASSET]: {key: value for key, value in row.items() if key != ASSET and value} for row in rows}
 
 
-class LakeFile(NamedTuple):
-    """A file of a lake, with the groups that its folders or its row name."""
-
-    asset: str
-    day: str
-    path: str
-    stamp: str
-    groups: dict[str, str]
-
-
-def _walk_folders(where: str, partition: tuple[str, str]) -> Iterator[LakeFile]:
+def _walk_folders(where: str, partition: tuple[str, str]) -> Iterator[AssetDay]:
+    """Yield each file, with the groups that its folders name."""
     from pyarrow import fs
 
     system, root = filesystem(where)
@@ -144,10 +135,11 @@ def _walk_folders(where: str, partition: tuple[str, str]) -> Iterator[LakeFile]:
         if partition[0] not in keys:
             raise RecordingError(f"{info.path}: no folder {partition[0]}=... above it: say with --partition which keys")
         asset, day = keys.pop(partition[0]), keys.pop(partition[1], UNDATED_DAY)
-        yield LakeFile(asset, day, prefix + info.path, f"{info.size} {info.mtime_ns}", keys)
+        yield AssetDay(asset, day, (prefix + info.path,), f"{info.size} {info.mtime_ns}", tuple(keys.items()))
 
 
-def _read_file_table(where: str, partition: tuple[str, str]) -> Iterator[LakeFile]:
+def _read_file_table(where: str, partition: tuple[str, str]) -> Iterator[AssetDay]:
+    """Yield each file, with the groups that its row names."""
     folder = Path(where).parent
     for i, row in enumerate(_read_csv(where), start=2):
         asset, file = row.pop(partition[0], ""), row.pop("file", "")
@@ -160,7 +152,7 @@ def _read_file_table(where: str, partition: tuple[str, str]) -> Iterator[LakeFil
             stamp = f"{state.st_size} {state.st_mtime_ns}"
         except OSError:
             stamp = "missing"  # reading the item will fail with the reason
-        yield LakeFile(asset, day, path, stamp, {key: value for key, value in row.items() if value})
+        yield AssetDay(asset, day, (path,), stamp, tuple((key, value) for key, value in row.items() if value))
 
 
 def _read_csv(where: str) -> list[dict[str, str]]:

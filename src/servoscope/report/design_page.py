@@ -35,7 +35,7 @@ def render_design_page(study: DesignStudy) -> str:
     after = format_clock_time(study.after_s, 0)
     return render_page(
         "design.html",
-        title=f"Before deployment: {study.loop}",
+        title=f"{study.loop}: {translate('before deployment')}",
         kind="healthy",
         study=study,
         size=(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from servoscope.core.messages import translate
 from servoscope.learning.inspection import Inspection
 from servoscope.models.loop import Loop
 from servoscope.report.format_values import DASH, format_duration, format_percent
@@ -31,7 +32,7 @@ def render_inspection_page(inspection: Inspection, recording: Recording) -> str:
     model = "loop" if named else "loop_file" if inspection.loop is not None else "generic"
     return render_page(
         "inspection.html",
-        title=f"{inspection.recording}: {inspection.verdict}",
+        title=f"{inspection.recording}: {translate(inspection.verdict)}",
         kind=KINDS[inspection.verdict],
         inspection=inspection,
         size=inspection_size(inspection),
@@ -86,4 +87,7 @@ def _numbers(inspection: Inspection) -> Iterator[tuple[str, str]]:
     if inspection.fit is not None:
         for name, coefficient in inspection.fit.coefficients.items():
             yield name, say("report.coefficient", value=coefficient.value, std=coefficient.std)
-        yield "condition number", f"{inspection.fit.condition:.3g}, weakest: {inspection.fit.weakest}"
+        yield (
+            "condition number",
+            say("report.weakest", condition=inspection.fit.condition, weakest=inspection.fit.weakest),
+        )

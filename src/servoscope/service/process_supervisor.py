@@ -46,11 +46,6 @@ class ProcessSupervisor:
         self._thread.start()
 
     @property
-    def running(self) -> bool:
-        """Whether there is a process now."""
-        return self._process is not None and self._process.poll() is None
-
-    @property
     def done(self) -> bool:
         """Whether there will be no further process."""
         return not self._thread.is_alive()

@@ -16,7 +16,6 @@ from servoscope.simulation.measurement import check_reference
 
 if TYPE_CHECKING:
     from servoscope.signals import Recording
-    from servoscope.simulation.cylinder_kernels import CylinderConstants
 
 REFERENCE_C = 45.0  # degC at which the rig's parameters hold
 SETTLING_S = 1.5  # for which the reference is held before the recording begins
@@ -220,7 +219,8 @@ def simulate_cylinder(
     p_a = (rig.area_b * p_b + rig.spring * r[0] + rig.weight) / rig.area_a
     begin[[0, 2, 3, 4, 7]] = r[0], p_a, p_b, -rig.zero, rig.pump_pressure
     u, acting, y, states = np.empty(N), np.empty(N), np.empty(N), np.empty((N, STATES))
-    run_cylinder(_constants(rig), laws, whole, feed, noise, begin, u, acting, y, states)
+    numbers, names = tuple(map(float, vars(rig).values())), tuple(vars(rig))
+    run_cylinder(numbers, laws, whole, feed, noise, begin, u, acting, y, states, names=names)
     if not np.isfinite(states).all():
         raise SimulationError("cylinder rig: the integration left all bounds, raise substeps")
     used = slice(settling, None)
@@ -280,19 +280,3 @@ def _laws(
     values["air"] = values["air"] * ATMOSPHERE_PA / POLYTROPIC
     values["mass"] = 1.0 / values["mass"]
     return np.column_stack(list(values.values()))
-
-
-def _constants(rig: CylinderRig) -> CylinderConstants:
-    from servoscope.simulation.cylinder_kernels import CylinderConstants
-
-    own = {name: getattr(rig, name) for name in CylinderConstants._fields if hasattr(rig, name)}
-    return CylinderConstants(
-        **own,
-        half_stroke=0.5 * rig.stroke,
-        damping=rig.valve_damping,
-        full_input=rig.limit,
-        integral_gain=rig.k_i / rig.sample_rate,
-        input_step=2.0 * rig.limit / 4096.0,
-        resolution=rig.stroke / 2.0**16,
-        T=1.0 / rig.sample_rate,
-    )._replace(hysteresis=0.5 * rig.hysteresis * rig.limit)

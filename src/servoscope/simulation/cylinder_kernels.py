@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 from servoscope.core.jit import maximum, minimum, sqrt, where
 from servoscope.core.jit.array_function import ArrayFunction
 from servoscope.core.jit.arrays import Array, Variable
+from servoscope.simulation.linear_kernels import runge_kutta_step
 
 TURBULENT_PA = 1e4  # pressure drop below which the flow through an edge becomes laminar, so that its slope is finite
 MIN_PRESSURE_PA = 1e4  # of a chamber: below it oil evaporates, and the bulk modulus is that of foam
@@ -33,45 +36,13 @@ class Law(NamedTuple):
     process_force: Any
 
 
-class CylinderConstants(NamedTuple):
-    """What does not change during a recording, in plain numbers and SI units."""
-
-    area_a: float
-    area_b: float
-    half_stroke: float
-    dead_volume: float
-    bulk_modulus: float
-    tank: float
-    supply_resistance: float
-    supply_capacity: float
-    null_opening: float
-    damping: float
-    bristle: float
-    bristle_damping: float
-    static_ratio: float
-    seal: float
-    stribeck_speed: float
-    spring: float
-    weight: float
-    contact: float
-    full_input: float
-    k_p: float
-    integral_gain: float
-    limit: float
-    hysteresis: float
-    input_step: float
-    resolution: float
-    T: float
-    substeps: int
-
-
 def flow(drop: Any) -> Any:
     """Return sign(drop) sqrt(|drop|), laminar near zero (Merritt, 1967, section 3-2)."""
     return drop / sqrt(abs(drop) + TURBULENT_PA)
 
 
-def derivative(printer: Any, p: CylinderConstants, law: Law, x: Sequence[Any], drive: Any) -> list[Any]:
-    """Return the time derivative of x = [y, y', p_A, p_B, spool, spool', bristle, p_S] under a held drive."""
+def derivative(printer: Any, p: Any, law: Law, drive: Any, x: Sequence[Any]) -> list[Any]:
+    """Return x' under a held drive, x = [y, y', p_A, p_B, spool, spool', bristle, p_S], of the rig p."""
     y, v, p_a, p_b, spool, spool_speed, z, p_s = x
     at = spool + law.zero
     out = maximum(at - law.overlap, 0.0) * law.gain_extend
@@ -84,8 +55,8 @@ def derivative(printer: Any, p: CylinderConstants, law: Law, x: Sequence[Any], d
     for pressure in (p_a, p_b):
         low = maximum(pressure, MIN_PRESSURE_PA)
         stiffness.append(p.bulk_modulus / (1.0 + p.bulk_modulus * law.air / (low * low)))
-    volume_a = p.dead_volume + p.area_a * (p.half_stroke + y)
-    volume_b = p.dead_volume + p.area_b * (p.half_stroke - y)
+    volume_a = p.dead_volume + p.area_a * (0.5 * p.stroke + y)
+    volume_b = p.dead_volume + p.area_b * (0.5 * p.stroke - y)
     coulomb = law.friction + p.seal * (p_a + p_b)
     ratio = v / p.stribeck_speed
     limit = coulomb * (1.0 + (p.static_ratio - 1.0) * printer.call_library("exp", -ratio * ratio))
@@ -99,7 +70,7 @@ def derivative(printer: Any, p: CylinderConstants, law: Law, x: Sequence[Any], d
         (into_a - from_a - p.area_a * v - leak) * stiffness[0] / volume_a,
         (into_b - from_b + p.area_b * v + leak) * stiffness[1] / volume_b,
         spool_speed,
-        law.valve * (law.valve * (drive - spool) - 2.0 * p.damping * spool_speed),
+        law.valve * (law.valve * (drive - spool) - 2.0 * p.valve_damping * spool_speed),
         slip,
         ((law.pump_pressure - p_s) / p.supply_resistance - into_a - into_b) / p.supply_capacity,
     ]
@@ -107,42 +78,37 @@ def derivative(printer: Any, p: CylinderConstants, law: Law, x: Sequence[Any], d
 
 @ArrayFunction
 def run_cylinder(
-    printer: Any, p: CylinderConstants, laws: Any, r: Any, feed: Any, n_y: Any, begin: Any, u: Any, acting: Any,
-    y: Any, truth: Any,
+    printer: Any, rig: Any, laws: Any, r: Any, feed: Any, n_y: Any, begin: Any, u: Any, acting: Any,
+    y: Any, truth: Any, *, names: tuple[str, ...],
 ) -> None:  # fmt: skip
     """Run the closed loop; `laws` (N, 12) holds rows of `Law`, `begin` (STATES,) the state at the first sample.
 
-    `feed` (N,) is the feed-forward of u. Writes u as logged, the spool's command from each sample to the next, y as
-    measured, each (N,), and the states (N, STATES).
+    `rig` holds the numbers of a `CylinderRig`, which are called `names`; `feed` (N,) is the feed-forward of u. Writes u
+    as logged, the spool's command from each sample to the next, y as measured, each (N,), and the states (N, STATES).
     """
-    x = Array.scratch(printer, "double", STATES)
+    p, x = SimpleNamespace(**dict(zip(names, rig, strict=True))), Array.scratch(printer, "double", STATES)
+    T, integral_gain, hysteresis = 1.0 / p.sample_rate, p.k_i / p.sample_rate, 0.5 * p.hysteresis * p.limit
+    input_step, resolution = 2.0 * p.limit / 4096.0, p.stroke / 2.0**16  # u has 12 bits, the sensor 16
     # the controller's sum, u of the sample before, and what the hysteresis of the valve makes of it
     total, late, held = (Variable(printer, 0.0 * feed[0]) for _ in range(3))
     for i in range(STATES):
         x[i] = begin[i]
-    h = p.T / printer.number(p.substeps)
+    h = T / p.substeps
     for k in printer.loop(0, r.shape[0]):
         law = Law(*(laws[k, i] for i in range(len(Law._fields))))
         for i in range(STATES):
             truth[k, i] = x[i]
-        y[k] = p.resolution * ((x[0] + n_y[k]) / p.resolution).call("rint")
+        y[k] = resolution * ((x[0] + n_y[k]) / resolution).call("rint")
         error = r[k] - y[k]
-        summed = total.value + p.integral_gain * error
+        summed = total.value + integral_gain * error
         wanted = feed[k] + p.k_p * error + summed
         limited = minimum(maximum(wanted, -p.limit), p.limit)
         # a sum that would only grow while u is at its limit is held
         total.value = where(abs(wanted) <= p.limit, summed, total.value)
-        u[k] = p.input_step * (limited / p.input_step).call("rint")
-        held.value = minimum(maximum(held.value, late.value - p.hysteresis), late.value + p.hysteresis)
+        u[k] = input_step * (limited / input_step).call("rint")
+        held.value = minimum(maximum(held.value, late.value - hysteresis), late.value + hysteresis)
         late.value = u[k]  # one sample of dead time
-        drive = held.value / p.full_input
+        drive = held.value / p.limit
         acting[k] = drive
-        for _ in printer.loop(0, p.substeps):
-            start, slopes = [x[i] for i in range(STATES)], []
-            at = start
-            for share in (0.5, 0.5, 1.0, None):
-                slopes.append(derivative(printer, p, law, at, drive))
-                if share is not None:
-                    at = [value + share * h * slope for value, slope in zip(start, slopes[-1], strict=True)]
-            for i, (a, b, c, d) in enumerate(zip(*slopes, strict=True)):
-                x[i] = start[i] + h / 6.0 * (a + 2.0 * b + 2.0 * c + d)
+        for _ in printer.loop(0, printer.truncate(p.substeps)):
+            runge_kutta_step(x, STATES, h, functools.partial(derivative, printer, p, law, drive))

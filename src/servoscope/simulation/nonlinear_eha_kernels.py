@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -11,7 +12,13 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.jit import maximum, sqrt, where
 from servoscope.core.jit.array_function import ArrayFunction
 from servoscope.core.jit.arrays import Array, Variable
-from servoscope.simulation.linear_kernels import HEADER_SIZE, INTEGRAL, ControllerConstants, control_step
+from servoscope.simulation.linear_kernels import (
+    HEADER_SIZE,
+    INTEGRAL,
+    ControllerConstants,
+    control_step,
+    runge_kutta_step,
+)
 
 
 class RigConstants(NamedTuple):
@@ -33,7 +40,7 @@ class RigConstants(NamedTuple):
     substeps: int
 
 
-def derivative(printer: Any, p: RigConstants, row: Any, x: Sequence[Any], drive: Any) -> list[Any]:
+def derivative(printer: Any, p: RigConstants, row: Any, drive: Any, x: Sequence[Any]) -> list[Any]:
     """Return the time derivative of x = [y, y', p_L, spool, spool'] under a held drive; row as in `run_rig`."""
     speed, pressure = x[1], x[2]
     has_valve = p.valve > 0.0
@@ -63,14 +70,7 @@ def integrate_state(printer: Any, p: RigConstants, row: Any, x: Any, drive: Any,
     steps = maximum(printer.truncate((printer.number(p.substeps) * duration / p.T - 1e-9).call("ceil")), 1)
     h = duration / printer.number(steps)
     for _ in printer.loop(0, steps):
-        begin, slopes = [x[i] for i in range(5)], []
-        at = begin
-        for share in (0.5, 0.5, 1.0, None):
-            slopes.append(derivative(printer, p, row, at, drive))
-            if share is not None:
-                at = [value + share * h * slope for value, slope in zip(begin, slopes[-1], strict=True)]
-        for i, (a, b, c, d) in enumerate(zip(*slopes, strict=True)):
-            x[i] = begin[i] + h / 6.0 * (a + 2.0 * b + 2.0 * c + d)
+        runge_kutta_step(x, 5, h, functools.partial(derivative, printer, p, row, drive))
         with printer.when(abs(x[0]) >= p.half_stroke):
             x[0] = where(x[0] > 0.0, p.half_stroke, -p.half_stroke)
             x[1] = where(x[0] * x[1] > 0.0, 0.0, x[1])

@@ -19,7 +19,7 @@ def print_study(out: Console, s: DesignStudy) -> None:
     after = format_duration(s.after_s)
     print_title(out, s.loop, ": " + say("report.design.reference", reference=s.reference, after=after))
     noise = say("cli.baseline.noise", u=s.noise_u_std, y=s.noise_y_std)
-    print_facts(out, [("noise", noise), ("false alarms", f"{s.false_alarms_per_year:g} per year")])
+    print_facts(out, [("noise", noise), ("false alarms", say("cli.per_year", count=s.false_alarms_per_year))])
     _print_faults(out, s)
     _print_sizes(out, s)
     print_result_table(out, design_page.limits_table(s))
@@ -33,7 +33,7 @@ def print_study(out: Console, s: DesignStudy) -> None:
 def print_learned_study(out: Console, s: BaselineStudy) -> None:
     """Print what a baseline alone says, and why not more."""
     print_title(out, s.loop, "")
-    print_facts(out, [("false alarms", f"{s.false_alarms_per_year:g} per year")])
+    print_facts(out, [("false alarms", say("cli.per_year", count=s.false_alarms_per_year))])
     print_result_table(out, design_page.learned_table(s))
     out.print()
     if len(s.faults) > 1:

@@ -11,6 +11,7 @@ from servoscope.cli.render.results import COLOURS, print_facts, print_notes, pri
 from servoscope.core.messages import count_words
 from servoscope.core.number_format import format_ratios
 from servoscope.report.format_values import DASH, format_probability
+from servoscope.report.page import say
 
 if TYPE_CHECKING:
     from servoscope.fleet import Fleet
@@ -49,7 +50,7 @@ def print_fleet(out: Console, f: Fleet) -> None:
         ]
         print_table(out, ("asset", "day", "state", "own", ""), own, words=5)
     if len(ill) > MAX_ASSETS_SHOWN:
-        print_notes(out, [f"{len(ill) - MAX_ASSETS_SHOWN} more are ill, see the report"])
+        print_notes(out, [say("cli.more_ill", count=len(ill) - MAX_ASSETS_SHOWN)])
     lost = [f"{asset} {day}: {why}" for asset, day, why in f.failed]
     lost += [f"{name}, not learned: {why}" for name, why in f.unlearned.items()]
     print_notes(out, lost[:MAX_ASSETS_SHOWN])

@@ -86,7 +86,7 @@ def commissioning_table(rows: Sequence[CommissioningRow]) -> Table:
         state, age = row.reception.state, row.age_s
         when = DASH
         if not math.isnan(age):
-            when = f"{format_duration(round(abs(age), 1))} {'ago' if age >= 0.0 else 'ahead'}"
+            when = say("cli.ago" if age >= 0.0 else "cli.ahead", duration=format_duration(round(abs(age), 1)))
         table.add_row(
             row.asset,
             row.source,

@@ -106,7 +106,7 @@ def print_notes(out: Console, texts: Iterable[object], colour: str = "yellow", m
 
 def print_written_path(out: Console, path: object) -> None:
     """Print that a file was written, on one line that can be copied."""
-    out.print(Text(f"  wrote {path}"), soft_wrap=True)
+    out.print(Text(f"  {say('cli.wrote', path=path)}"), soft_wrap=True)
 
 
 def print_command(out: Console, text: str, command: str) -> None:
@@ -122,11 +122,10 @@ def print_baseline(out: Console, baseline: Baseline) -> None:
 
 
 def _print_operating_point(out: Console, b: Baseline) -> None:
-    at = f" at {b.point}" if b.point else ""
-    if b.loop.name == type(b.loop).model_fields["name"].default:
-        print_title(out, "Baseline", f"{at} from {_format_sources(b)}")
-    else:
-        print_title(out, b.loop.name, f": baseline{at} from {_format_sources(b)}")
+    at = say("cli.baseline.at", point=b.point) if b.point else None
+    unnamed = b.loop.name == type(b.loop).model_fields["name"].default
+    title = say("cli.baseline.unnamed" if unnamed else "cli.baseline.named", at=at, sources=_format_sources(b))
+    print_title(out, translate("Baseline") if unnamed else b.loop.name, title)
     std = [math.sqrt(b.covariance[i][i]) for i in range(len(b.theta))]
     rows = [
         (name, f"{value:.5g}", f"{s:.2g}", f"{100.0 * abs(s / value):.2g} %" if value else DASH)
@@ -135,7 +134,10 @@ def _print_operating_point(out: Console, b: Baseline) -> None:
     changes = b.detectability.changes
     header = ("fault",) if all(p.name == p.parameter for p in changes) else ("fault", "parameter")
     promised = [
-        (*(p.name, p.parameter)[: len(header)], format_percent(p.change) if p.change is not None else "never")
+        (
+            *(translate(p.name), p.parameter)[: len(header)],
+            format_percent(p.change) if p.change is not None else translate("never"),
+        )
         for p in changes
     ]
     severity = [(f.name, f"{len(f.shares)}", f"{min(f.shares):.2f} to {max(f.shares):.2f}") for f in b.learned]
@@ -191,7 +193,7 @@ def _baseline_facts(b: Baseline) -> Iterator[tuple[str, str]]:
 def _format_sources(b: Baseline) -> str:
     length = format_duration(sum(source.duration_s for source in b.sources))
     if len(b.sources) > 3:
-        return f"{len(b.sources)} recordings, {length}"
+        return say("cli.baseline.sources", count=len(b.sources), duration=length)
     return f"{', '.join(source.name for source in b.sources)}, {length}"
 
 
@@ -200,7 +202,7 @@ def print_channels(out: Console, path: Path, channels: Sequence[ChannelInfo]) ->
     from servoscope.signals.readers.axes import signal_names
     from servoscope.signals.readers.guess_columns import format_mapping, guess_mapping
 
-    print_title(out, path.name, f": {len(channels)} columns")
+    print_title(out, path.name, f": {say('cli.columns', count=len(channels))}")
     limits = [[f"{x:.6g}" if math.isfinite(x) else DASH for x in (c.min, c.max)] for c in channels]
     rows = [(c.name, c.dtype, *limit) for c, limit in zip(channels, limits, strict=True)]
     print_table(out, ("column", "type", "smallest", "largest"), rows, words=2)
@@ -222,7 +224,9 @@ def print_column_mapping(out: Console, columns: Columns) -> None:
 
 def print_simulation(out: Console, path: str, reference: str, recording: Recording, truth: Truth) -> None:
     """Print what was simulated, with its truth."""
-    print_title(out, recording.name, f": {format_duration(recording.duration_s)}, {recording.samples} samples")
+    print_title(
+        out, recording.name, f": {format_duration(recording.duration_s)}, {recording.samples} {translate('samples')}"
+    )
     named = {fault.parameter: fault.name for fault in truth.plant.all_faults}
     facts = [("reference", reference)]
     for event in truth.faults:
@@ -230,7 +234,7 @@ def print_simulation(out: Console, path: str, reference: str, recording: Recordi
         known = {"parameter": event.parameter, "ratio": event.ratio, "at": event.at_s, "over": over}
         what = say("cli.truth", **known)
         facts.append(("truth", f"{named[event.parameter]}: {what}" if event.parameter in named else what))
-    print_facts(out, facts if truth.faults else [*facts, ("truth", "healthy")])
+    print_facts(out, facts if truth.faults else [*facts, ("truth", translate("healthy"))])
     print_written_path(out, path)
 
 

@@ -217,14 +217,6 @@ def _restore(given: Any, text: Any) -> Any:
     return found
 
 
-def _format_percent(value: float) -> str:
-    return f"{100.0 * value:.3g} %"
-
-
-def _format_probability(value: float) -> str:
-    return "> 99.9 %" if value > 0.999 else f"{100.0 * value:.3g} %"
-
-
 def _format_utc(value: float) -> str:
     zone = _zone.get()
     try:
@@ -237,9 +229,9 @@ def _format_utc(value: float) -> str:
 
 FORMATS: Mapping[str, Callable[[Any], str]] = {
     "short": format_short,
-    "percent": _format_percent,
+    "percent": lambda value: f"{100.0 * value:.3g} %",
     "share": format_share,
-    "probability": _format_probability,
+    "probability": lambda value: "> 99.9 %" if value > 0.999 else f"{100.0 * value:.3g} %",
     "utc": _format_utc,
     "moment": format_moment,
     "first_moment": lambda value: format_moment(value).removesuffix(" s"),  # whose unit follows the second one

@@ -28,7 +28,7 @@ LAGS = 2  # delayed copies of the last column, for changes that come between sam
 class CusumConstants(NamedTuple):
     """Constants of the sequential test; without members there is none.
 
-    ``A, B, C, D, X0`` are the shadow, r -> [residual, phi]; `theta` the coefficients that the residual is formed with;
+    `shadow` leads from r to [residual, phi]; `theta` the coefficients that the residual is formed with;
     `numerator` and `denominator` the whitening filter, both of one length, first element 1, and `gain` its factor;
     `warm` the updates that it needs; `changes` (members, n + `LAGS`) the weights of the columns and `limits`
     (members,) where a CUSUM alarms. With `directions` (q, n + `LAGS`), whose combinations the changes are, CUSUMs step
@@ -36,11 +36,7 @@ class CusumConstants(NamedTuple):
     without, at each update. Scaled as `estimation.recursion.RecursionConstants`.
     """
 
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-    X0: FloatArray
+    shadow: LinearSystem
     theta: FloatArray
     numerator: FloatArray
     denominator: FloatArray

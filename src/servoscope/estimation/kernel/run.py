@@ -160,16 +160,12 @@ class LaneBlock:
     def unpack(self, state: str, places: Sequence[Int]) -> None:
         """Write how states, which begin at some places, are copied to the lanes."""
         for memory, begin, count in self._parts:
-            self._copy(memory, count, [place + begin for place in places], state, "double", out=False)
+            self.copy(memory, count, [place + begin for place in places], state, "double", out=False)
 
     def pack(self, state: str, places: Sequence[Int]) -> None:
         """Write how the lanes are copied to states."""
         for memory, begin, count in self._parts:
-            self._copy(memory, count, [place + begin for place in places], state, "double", out=True)
-
-    def write_out(self, q: Memory, out: str, places: Sequence[Int]) -> None:
-        """Write how evaluations are copied to where they belong."""
-        self._copy(q, self.size.row, places, out, self.element, out=True)
+            self.copy(memory, count, [place + begin for place in places], state, "double", out=True)
 
     def fetch(self, signals: Sequence[str], places: Sequence[Int], samples: Int) -> None:
         """Write how samples from some places on are copied to the tile, as many as it holds."""
@@ -209,7 +205,7 @@ class LaneBlock:
         header = (self.h, 0, HEADER_SIZE)
         return header, (self.s, HEADER_SIZE, floats), (self.g, HEADER_SIZE + floats, watched)
 
-    def _copy(self, memory: Memory, count: int, places: Sequence[Int], base: str, element: str, *, out: bool) -> None:
+    def copy(self, memory: Memory, count: int, places: Sequence[Int], base: str, element: str, *, out: bool) -> None:
         """Write how rows of lanes are copied from or to an array in which the numbers of a lane are neighbours."""
         p = self.p
         if self.lanes > 1 and count >= LINE:
@@ -250,11 +246,6 @@ class LaneBlock:
                 self._store((target[0], place), Float(p, column, source[0]))
 
 
-def assets_of_lanes(p: LlvmPrinter, first: Int, lanes: int, assets: Int) -> list[Int]:
-    """Return the asset of each lane; the last one fills the lanes that are left."""
-    return [minimum(first + lane, assets - 1) for lane in range(lanes)]
-
-
 def run_blocks(p: LlvmPrinter, spec: KernelSpec, lanes: int, element: str, own: bool) -> None:
     """Write the blocks of lanes from `begin` to `end`: r, u, y (assets, N) lead from `state` to `new` and `out`.
 
@@ -269,7 +260,7 @@ def run_blocks(p: LlvmPrinter, spec: KernelSpec, lanes: int, element: str, own: 
     for b in p.loop(whole["begin"], whole["end"]):
         place = p.place(element, "%constants", b * whole["constant_step"])
         c = Memory(p, place, element, lanes, shared=lanes > 1 and not own)
-        row = assets_of_lanes(p, b * lanes, lanes, assets)
+        row = [minimum(b * lanes + lane, assets - 1) for lane in range(lanes)]  # the last one fills what is left
         states = [asset * (floats + private) for asset in row]
         block.unpack("%state", states)
         block.clear_restarts()
@@ -298,7 +289,8 @@ def run_blocks(p: LlvmPrinter, spec: KernelSpec, lanes: int, element: str, own: 
             since.value = where(last, 0, ends)
             with p.when(last):
                 block.evaluate(c, q)
-                block.write_out(q, "%out", [asset * whole["out_step"] + column.value for asset in row])
+                places = [asset * whole["out_step"] + column.value for asset in row]
+                block.copy(q, size.row, places, "%out", element, out=True)
                 column.value = column.value + size.row
         block.pack("%new", states)
 

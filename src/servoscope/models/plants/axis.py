@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from servoscope.core.arrays import FloatArray
-from servoscope.models.plants.base import SIGN_CUTOFF, Fault, read_translations
+from servoscope.models.plants.base import Fault, read_translations
 from servoscope.models.plants.columns import COLUMN_FORMS, Column
-from servoscope.models.plants.terms import TermColumn, TermPlant
+from servoscope.models.plants.terms import TERM_TUPLE, UNIQUE_TERMS, TermColumn, TermPlant
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 NOT_DUMPED = Field(exclude_if=lambda value: value in (None, "position"))  # hashes of loops without it stay as they were
@@ -101,10 +101,6 @@ PAYLOAD_FAULTS = {
 GRAVITY_ACCELERATION = 9.81  # m/s^2
 
 
-def _as_tuple(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value  # TOML has lists, and plants are read strictly
-
-
 class AxisPlant(TermPlant):
     """Motor axis ``input_gain u = inertia y'' + sum of terms``, each a coefficient times a function of y and y'.
 
@@ -114,7 +110,7 @@ class AxisPlant(TermPlant):
     translations: ClassVar[Mapping[str, Mapping[str, str]]] = read_translations(__file__)
 
     kind: Literal["axis"] = "axis"
-    terms: Annotated[tuple[TermName, ...], BeforeValidator(_as_tuple)] = ("viscous", "coulomb", "offset")
+    terms: Annotated[tuple[TermName, ...], TERM_TUPLE, UNIQUE_TERMS] = ("viscous", "coulomb", "offset")
     # speed [output per s] at which the term ``stribeck`` has fallen to a half
     stribeck_speed: Positive | None = None
     # distance [output] after which the term ``cogging`` repeats
@@ -127,19 +123,9 @@ class AxisPlant(TermPlant):
     payload_mass: Annotated[Positive | None, NOT_DUMPED] = None
     # what the output is: a position, or a speed, as drives log it; then no term can depend on the position
     y: Annotated[Literal["position", "speed"], NOT_DUMPED] = "position"
-    # speed [output per s] below which sign(y') is not trusted and set to 0
-    sign_speed: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
-    # where the sign of the recursion comes from: the measured output, or the reference where y is noisy or slow
-    sign_from: Literal["output", "reference"] = "output"
-    # cutoff [Hz] of the differentiator behind the sign
-    sign_cutoff: Positive = SIGN_CUTOFF
-    # nominal values by name, all of `names`; `learn` needs none
-    coefficients: dict[str, Finite] | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if len(set(self.terms)) < len(self.terms):
-            raise ValueError("terms: one stands twice, remove it")
         if {"viscous", "viscous_by_direction"} <= set(self.terms):
             raise ValueError("terms: viscous_by_direction takes the place of viscous, remove one of them")
         for term, key in (("stribeck", "stribeck_speed"), ("cogging", "period")):

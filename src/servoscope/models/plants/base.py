@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr
@@ -295,50 +295,3 @@ class Plant(BaseModel, abc.ABC):
                 raise LoopError(f"{name}: not a parameter of plant {self.kind}, which has {', '.join(known)}")
             if not (np.isfinite(ratio) and ratio > 0.0):
                 raise LoopError(f"{name}={ratio:g}: the ratio to the nominal value must be positive and finite")
-
-
-class CoefficientPlant(Plant):
-    """Plant whose parameters are the coefficients themselves, with nominal values by name in a field `coefficients`."""
-
-    # smallest and largest ratio to the nominal value that is searched, by parameter, and of all others
-    RATIO_RANGES: ClassVar[Mapping[str, tuple[float, float]]] = {
-        "inertia": (0.2, 5.0),
-        "moved_mass": (0.2, 5.0),
-        "input_gain": (0.3, 3.0),
-    }
-    DEFAULT_RANGE: ClassVar[tuple[float, float]] = (0.1, 10.0)
-
-    if TYPE_CHECKING:  # fields of each plant, at the place that they have in its loop file
-        coefficients: dict[str, float] | None
-        sign_speed: float
-        sign_from: Literal["output", "reference"]
-        sign_cutoff: float
-
-    @property
-    def has_physics(self) -> bool:
-        """Whether nominal coefficients are given."""
-        return self.coefficients is not None
-
-    @property
-    def velocity_sign(self) -> VelocitySign:
-        """As its settings say."""
-        return VelocitySign(self.sign_from == "reference", self.sign_cutoff, self.sign_speed)
-
-    def with_sample_rate(self, rate: float) -> Self:
-        """Return the same plant; a `sign_cutoff` that nobody set lies below the Nyquist frequency."""
-        if "sign_cutoff" in self.model_fields_set or self.sign_cutoff < rate / 2:
-            return self
-        return self.model_copy(update={"sign_cutoff": rate / 4})
-
-    def theta(self) -> FloatArray:
-        """Nominal coefficients, shape (n,) [u per output per s^power]."""
-        nominal = self._nominal()
-        return np.array([nominal[name] for name in self.names], dtype=np.float64)
-
-    def _nominal(self) -> dict[str, float]:
-        if self.coefficients is None:
-            raise LoopError("[plant] coefficients: missing, simulation and nominal values need them")
-        return self.coefficients
-
-    def _fault(self, name: str, parameter: str, words: str, checks: str) -> Fault:
-        return Fault(name, parameter, self.RATIO_RANGES.get(parameter, self.DEFAULT_RANGE), words, checks)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from servoscope.core.errors import LoopError
-from servoscope.models.plants.base import SIGN_CUTOFF, Fault, StateSpace, read_translations
+from servoscope.models.plants.base import Fault, StateSpace, read_translations
 from servoscope.models.plants.columns import Column
-from servoscope.models.plants.terms import TermColumn, TermPlant
+from servoscope.models.plants.terms import TERM_TUPLE, UNIQUE_TERMS, TermColumn, TermPlant
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -96,10 +96,6 @@ FAULTS: dict[str, tuple[str, tuple[float, float], str, str]] = {
 }
 
 
-def _as_tuple(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value  # TOML has lists, and plants are read strictly
-
-
 class CylinderPlant(TermPlant):
     """Cylinder ``input_gain u = c_forward max(y', 0) + c_backward min(y', 0) + acceleration y'' + sum of terms``.
 
@@ -113,26 +109,16 @@ class CylinderPlant(TermPlant):
     translations: ClassVar[Mapping[str, Mapping[str, str]]] = read_translations(__file__)
 
     kind: Literal["cylinder"] = "cylinder"
-    terms: Annotated[tuple[TermName, ...], BeforeValidator(_as_tuple)] = (
+    terms: Annotated[tuple[TermName, ...], TERM_TUPLE, UNIQUE_TERMS] = (
         "spring",
         "overlap",
         "offset",
     )
     # output beyond which the force of the term ``process`` acts
     contact: Finite | None = None
-    # speed [output per s] below which sign(y') is not trusted and set to 0
-    sign_speed: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
-    # where the sign of the recursion comes from: the measured output, or the reference where y is noisy or slow
-    sign_from: Literal["output", "reference"] = "output"
-    # cutoff [Hz] of the differentiator behind the sign
-    sign_cutoff: Positive = SIGN_CUTOFF
-    # values by name, all of `names`, as `learn` finds them
-    coefficients: dict[str, Finite] | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if len(set(self.terms)) < len(self.terms):
-            raise ValueError("terms: one stands twice, remove it")
         if ("process" in self.terms) != (self.contact is not None):
             raise ValueError("contact: belongs to the term process, give both or none of them")
         if self.coefficients is not None and set(self.coefficients) != set(self.names):

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from servoscope.models.plants.base import SIGN_CUTOFF, Fault, read_translations
+from servoscope.models.plants.base import Fault, read_translations
 from servoscope.models.plants.columns import Column
 from servoscope.models.plants.terms import TermColumn, TermPlant
 
@@ -52,14 +52,6 @@ class PolynomialPlant(TermPlant):
     # ``coulomb`` adds F_c sign(y'); ``directional`` also lets the viscous friction differ by direction
     friction: FrictionKind = "none"
     offset: bool = False  # whether a constant is added, for example gravity or a biased amplifier
-    # speed [output per s] below which sign(y') is not trusted and set to 0
-    sign_speed: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
-    # where the sign comes from: the measured output, or the reference where y is noisy or slow
-    sign_from: Literal["output", "reference"] = "output"
-    # cutoff [Hz] of the differentiator behind the sign
-    sign_cutoff: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = SIGN_CUTOFF
-    # nominal values by name, all of `names`; needed for simulation and for a nominal baseline only
-    coefficients: dict[str, Finite] | None = None
 
     @model_validator(mode="after")
     def _coefficients_fit(self) -> Self:

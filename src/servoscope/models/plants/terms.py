@@ -5,12 +5,28 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
+from pydantic import AfterValidator, BeforeValidator, Field
 
-from servoscope.models.plants.base import CoefficientPlant, StateSpace, matrices
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import LoopError
+from servoscope.models.plants.base import SIGN_CUTOFF, Fault, Plant, StateSpace, VelocitySign, matrices
 from servoscope.models.plants.columns import Column
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value  # TOML has lists, and plants are read strictly
+
+
+def _check_distinct(terms: tuple[str, ...]) -> tuple[str, ...]:
+    if len(set(terms)) < len(terms):
+        raise ValueError("one stands twice, remove it")
+    return terms
+
+
+TERM_TUPLE, UNIQUE_TERMS = BeforeValidator(_as_tuple), AfterValidator(_check_distinct)
 
 
 @dataclass(frozen=True)
@@ -23,11 +39,44 @@ class TermColumn:
     signed: bool = False  # whether the coefficient may be negative
 
 
-class TermPlant(CoefficientPlant):
+class TermPlant(Plant):
     """Plant whose coefficients each multiply one column; its parameters multiply one or several coefficients."""
+
+    # smallest and largest ratio to the nominal value that is searched, by parameter, and of all others
+    RATIO_RANGES: ClassVar[Mapping[str, tuple[float, float]]] = {
+        "inertia": (0.2, 5.0),
+        "moved_mass": (0.2, 5.0),
+        "input_gain": (0.3, 3.0),
+    }
+    DEFAULT_RANGE: ClassVar[tuple[float, float]] = (0.1, 10.0)
 
     # the parameters that move several coefficients: by parameter, the power of its ratio with which each goes
     EXPONENTS: ClassVar[Mapping[str, Mapping[str, float]]] = {}
+
+    # speed [output per s] below which sign(y') is not trusted and set to 0
+    sign_speed: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
+    # where the sign of the recursion comes from: the measured output, or the reference where y is noisy or slow
+    sign_from: Literal["output", "reference"] = "output"
+    # cutoff [Hz] of the differentiator behind the sign
+    sign_cutoff: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = SIGN_CUTOFF
+    # nominal values by name, all of `names`; `learn` needs none
+    coefficients: dict[str, Annotated[float, Field(allow_inf_nan=False)]] | None = None
+
+    @property
+    def has_physics(self) -> bool:
+        """Whether nominal coefficients are given."""
+        return self.coefficients is not None
+
+    @property
+    def velocity_sign(self) -> VelocitySign:
+        """As its settings say."""
+        return VelocitySign(self.sign_from == "reference", self.sign_cutoff, self.sign_speed)
+
+    def with_sample_rate(self, rate: float) -> Self:
+        """Return the same plant; a `sign_cutoff` that nobody set lies below the Nyquist frequency."""
+        if "sign_cutoff" in self.model_fields_set or self.sign_cutoff < rate / 2:
+            return self
+        return self.model_copy(update={"sign_cutoff": rate / 4})
 
     @property
     @abc.abstractmethod
@@ -67,6 +116,19 @@ class TermPlant(CoefficientPlant):
                 for name, power in self.exponents(parameter).items():
                     moved[name] = moved[name] * (factor if power == 1.0 else factor**power)
         return self.model_copy(update={"coefficients": moved})
+
+    def theta(self) -> FloatArray:
+        """Nominal coefficients, shape (n,) [u per output per s^power]."""
+        nominal = self._nominal()
+        return np.array([nominal[name] for name in self.names], dtype=np.float64)
+
+    def _nominal(self) -> dict[str, float]:
+        if self.coefficients is None:
+            raise LoopError("[plant] coefficients: missing, simulation and nominal values need them")
+        return self.coefficients
+
+    def _fault(self, name: str, parameter: str, words: str, checks: str) -> Fault:
+        return Fault(name, parameter, self.RATIO_RANGES.get(parameter, self.DEFAULT_RANGE), words, checks)
 
     def _polynomial(self) -> list[Any]:
         """Return the coefficients of all powers of s from 0 on; friction by direction enters with its mean."""

@@ -139,7 +139,8 @@ class Evaluator:
 
 def nominal_signatures(loop: Loop) -> dict[str, tuple[FloatArray, ComplexArray]]:
     """Return Gamma as each fault of Table 2 grows, by the plant's parameters alone."""
-    E = Pipeline.of(_without_stage_one(loop)).bank.E(FREQUENCIES)
+    single = loop.monitor.model_copy(update={"two_stage": "none"})
+    E = Pipeline.of(loop.model_copy(update={"monitor": single})).bank.E(FREQUENCIES)
     healthy = nominal_theta(loop)
     found = {}
     for fault in loop.plant.faults:
@@ -159,10 +160,6 @@ def labelled_signatures(courses: Sequence[ResidualTrace]) -> dict[str, tuple[Flo
         sizes.append(case.ratio)
         curve.append(course.between(50.0, np.inf).gamma.mean(axis=0))
     return {name: (np.array(sizes), np.array(curve)) for name, (sizes, curve) in found.items()}
-
-
-def _without_stage_one(loop: Loop) -> Loop:
-    return loop.model_copy(update={"monitor": loop.monitor.model_copy(update={"two_stage": "none"})})
 
 
 @dataclass(frozen=True, eq=False)

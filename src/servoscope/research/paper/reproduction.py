@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from servoscope.core.files import atomic_write, make_folder
-from servoscope.core.workers import WorkerError, Workers, available_cores
+from servoscope.core.workers import WorkerError, Workers
+from servoscope.estimation.kernel.threads import core_count
 from servoscope.research.paper import claims, jobs
 from servoscope.research.paper.claims import Claim
 from servoscope.research.paper.jobs import SeedJob
@@ -41,17 +42,11 @@ class Reproduction:
         return {"seeds": list(self.seeds), "claims": [claim.to_dict() for claim in self.claims]}
 
 
-def run_reproduction(
-    seeds: Sequence[int], told: StepCallback = lambda _: None, processes: int | None = None
-) -> Reproduction:
-    """Measure everything.
-
-    `told`: told the name of each job that is done; `processes`: none: one per core.
-    """
+def run_reproduction(seeds: Sequence[int], told: StepCallback = lambda _: None) -> Reproduction:
+    """Measure everything, on all cores; `told` takes the name of each job that is done."""
     work = jobs.list_jobs(seeds)
-    count = min(available_cores() if processes is None else processes, len(work))
     done: list[tuple[SeedJob, dict[str, float]]] = []
-    for job, found in run_jobs(work, count):
+    for job, found in run_jobs(work, min(core_count(), len(work))):
         done.append((job, found))
         told(f"seed {job.seed}, {job.part}")
     metrics = jobs.merge_metrics(done)

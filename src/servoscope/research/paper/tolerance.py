@@ -18,7 +18,7 @@ from servoscope.research.paper.method import EvaluatorResult, FaultManager
 from servoscope.research.paper.tracking import TUNING_SEED_OFFSET
 from servoscope.signals import Recording
 from servoscope.simulation import closed_loop_poles, simulate_response
-from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD
+from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD, draw_noise
 from servoscope.simulation.stability import controller_gains
 
 CASES = (FaultCase("p_s", 0.6), FaultCase("beta", 0.005))
@@ -32,7 +32,6 @@ EVALUATION_SPAN_S = (50.0, 60.0)  # s over which tracking is judged
 class ReschedulingResult:
     """One fault with and without action."""
 
-    case: FaultCase
     fault: str | None  # fault, ratio: what the diagnosis said; None: nothing that could be acted on
     ratio: float | None
     at_s: float | None  # when the gains changed; None: never
@@ -81,9 +80,7 @@ def simulate_gain_change(
     """
     T = 1.0 / loop.sample_rate
     r = PAPER.reference_signal()
-    rng = np.random.default_rng(seed)
-    n_u = NOISE_U_STD * rng.standard_normal(r.size)
-    n_y = NOISE_Y_STD * rng.standard_normal(r.size)
+    n_u, n_y = draw_noise(r.size, NOISE_U_STD, NOISE_Y_STD, seed)
     fault_plant = loop.plant.with_ratios({case.parameter: case.ratio})
     healthy, faulty = (
         discretise(plant.state_space(), loop.sample_rate, hold="zoh") for plant in (loop.plant, fault_plant)
@@ -117,7 +114,7 @@ def evaluate_rescheduling(case: FaultCase, seed: int) -> ReschedulingResult:
     diagnosis = diagnose(baseline, idle)
     k_p, integrating = controller_gains(loop)
     old = (k_p, integrating * loop.sample_rate)
-    untouched = ReschedulingResult(case, None, None, None, old, idle.t, idle.r, idle.y, idle.y)
+    untouched = ReschedulingResult(None, None, None, old, idle.t, idle.r, idle.y, idle.y)
     if diagnosis.detected_at_s is None:
         return untouched
     at = diagnosis.detected_at_s + DIAGNOSIS_DELAY_S
@@ -127,11 +124,11 @@ def evaluate_rescheduling(case: FaultCase, seed: int) -> ReschedulingResult:
     fault = diagnosis.faults[0]
     finding = EvaluatorResult(diagnosis.detected_at_s, fault.name, fault.ratio)
     if FaultManager().decide(finding) != "reconfigure":
-        return ReschedulingResult(case, fault.name, fault.ratio, None, old, idle.t, idle.r, idle.y, idle.y)
+        return ReschedulingResult(fault.name, fault.ratio, None, old, idle.t, idle.r, idle.y, idle.y)
     controller = reschedule_gains(loop, loop.plant.with_ratios({fault.parameter: fault.ratio}))
     acted = simulate_gain_change(loop, case, seed, (at, controller))
     new = (controller.k_p, controller.k_i)
-    return ReschedulingResult(case, fault.name, fault.ratio, at, new, idle.t, idle.r, idle.y, acted.y)
+    return ReschedulingResult(fault.name, fault.ratio, at, new, idle.t, idle.r, idle.y, acted.y)
 
 
 def tolerance_metrics(seed: int) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -314,12 +315,16 @@ class RecentSignals(SignalColumns):
 
 def alarm_rows(asset: str, alarms: Mapping[str, AlarmStatus]) -> list[AlarmRow]:
     """Return the alarms of a status that are not normal."""
-    rows = []
-    for name, alarm in alarms.items():
-        if alarm.state is not LifecycleState.NORMAL:
-            commands = [each for each in COMMAND_NAMES if (alarm.state, LifecycleEvent(each)) in TRANSITION_TABLE]
-            rows.append(AlarmRow(asset=asset, alarm=name, commands=commands, **dict(alarm)))
-    return rows
+    return [
+        AlarmRow(
+            asset=asset,
+            alarm=name,
+            commands=[each for each in COMMAND_NAMES if (alarm.state, LifecycleEvent(each)) in TRANSITION_TABLE],
+            **dict(alarm),
+        )
+        for name, alarm in alarms.items()
+        if alarm.state is not LifecycleState.NORMAL
+    ]
 
 
 def fault_sizes(status: AssetStatus) -> list[FaultSize]:
@@ -340,14 +345,19 @@ def fault_sizes(status: AssetStatus) -> list[FaultSize]:
 
 def coefficient_intervals(status: AssetStatus) -> list[CoefficientInterval]:
     """Return the coefficients of the newest evaluation."""
-    units, rows = status.metadata.coefficient_units, []
-    for i, (name, value, std, nominal) in enumerate(status.parameters):
-        low, high = value - NORMAL_95 * std, value + NORMAL_95 * std
-        unit = units[i] if i < len(units) else ""
-        rows.append(
-            CoefficientInterval(name=name, value=value, std=std, low=low, high=high, nominal=nominal, unit=unit)
+    units = itertools.chain(status.metadata.coefficient_units, itertools.repeat(""))
+    return [
+        CoefficientInterval(
+            name=name,
+            value=value,
+            std=std,
+            low=value - NORMAL_95 * std,
+            high=value + NORMAL_95 * std,
+            nominal=nominal,
+            unit=unit,
         )
-    return rows
+        for (name, value, std, nominal), unit in zip(status.parameters, units, strict=False)
+    ]
 
 
 def relative_residual(status: AssetStatus) -> float | None:
