@@ -34,6 +34,7 @@ from servoscope.diagnosis.result import (
     FinalCoefficient,
     ResponsePoint,
     Verdict,
+    keep_inputs,
     recording_facts,
 )
 from servoscope.diagnosis.sensor_check import check_sensors
@@ -65,8 +66,7 @@ if TYPE_CHECKING:
 
 MIN_CERTAINTY = 0.95  # probability from which a fault is named
 MAX_SIGNAL = 1e60  # of a signal; products of four of them still are numbers
-# probability of an unknown change from which an operating point does not explain a recording
-MIN_UNKNOWN_PROBABILITY = 0.05
+MIN_UNKNOWN_PROBABILITY = 0.05  # of an unknown change, from which an operating point does not explain a recording
 
 
 @with_one_blas_thread
@@ -108,7 +108,8 @@ def diagnose(
     [('lubrication', 1.25)]
     """
     learned = Baseline.of(baseline)
-    return _diagnose_at_point(learned, as_recording(recording, learned.loop), progress, point)[0]
+    diagnosis = _diagnose_at_point(learned, as_recording(recording, learned.loop), progress, point)[0]
+    return keep_inputs(diagnosis, baseline if point is None else learned.at(point), recording)
 
 
 @with_one_blas_thread
