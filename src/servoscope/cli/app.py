@@ -31,6 +31,7 @@ GROUPS = {
         "history",
         "trend",
         "alarms",
+        "relearn",
         "store",
         "serve",
         "users",

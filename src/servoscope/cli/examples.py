@@ -25,6 +25,7 @@ EXAMPLES = {
     "alarms unshelve": "servoscope alarms unshelve hall.toml press fault --why 'seal changed'",
     "alarms out-of-service": "servoscope alarms out-of-service hall.toml press fault --why 'seal changed'",
     "alarms return": "servoscope alarms return hall.toml press fault --why 'seal changed'",
+    "relearn": "servoscope relearn hall.toml press --since 1h --why 'seal changed'",
     "store backup": "servoscope store backup hall.toml hall.backup",
     "store restore": "servoscope store restore hall.backup hall.toml",
     "serve": "servoscope serve hall.toml --listen 127.0.0.1:8080",

@@ -103,7 +103,7 @@ class FileSettings(Settings):
     """Settings that are a file of their own; `kind_of_file` is what messages call it."""
 
     kind_of_file: ClassVar[str]
-    _folder: Path = PrivateAttr(default=Path())
+    _file: Path = PrivateAttr(default=Path("settings.toml"))
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -115,10 +115,15 @@ class FileSettings(Settings):
             )
         except ValidationError as error:
             raise ConfigError(f"{path}: {describe_error(error, cls)}") from None
-        found._folder = path.absolute().parent
+        found._file = path.absolute()
         return found
 
     @property
     def folder(self) -> Path:
         """What its paths are relative to."""
-        return self._folder
+        return self._file.parent
+
+    @property
+    def file(self) -> Path:
+        """The file itself."""
+        return self._file
