@@ -13,7 +13,7 @@ from typing import Any
 import sqlalchemy as sa
 from reliability.servers import Postgres
 
-from servoscope.service.layer_times import LayerTimes
+from servoscope.service.clock import LayerTimes
 from servoscope.service.metrics import ServiceMetrics
 from servoscope.service.store import Batch, Store
 

@@ -30,7 +30,6 @@ from servoscope.service.actions import (
     deliver,
     diagnosis_entries,
     flood_entries,
-    initial_tolerance_state,
     transition_entries,
 )
 from servoscope.service.actions.outbox import schedule_retry
@@ -322,8 +321,8 @@ def gain(**more: Any) -> FaultToleranceSettings:
 
 def test_a_change_is_off_unless_told_otherwise() -> None:
     settings = gain()
-    assert accommodate_fault("soft", settings, initial_tolerance_state(settings), "press 1", 0.5, NOW, NOW) == (
-        initial_tolerance_state(settings),
+    assert accommodate_fault("soft", settings, FaultToleranceState(settings.nominal), "press 1", 0.5, NOW, NOW) == (
+        FaultToleranceState(settings.nominal),
         None,
         None,
     )
@@ -331,7 +330,7 @@ def test_a_change_is_off_unless_told_otherwise() -> None:
 
 def test_a_change_goes_step_by_step_within_its_bounds_and_back_again() -> None:
     settings = gain(mode="recommend")
-    state, changes = initial_tolerance_state(settings), []
+    state, changes = FaultToleranceState(settings.nominal), []
     ratios = [(0.0, 0.999), (1.0, 0.5), (2.0, 0.5), (3.0, 0.5), (3602.0, 0.5), (7300.0, None), (7301.0, None)]
     for when, ratio in ratios:
         state, change, row = accommodate_fault("soft", settings, state, "press 1", ratio, when, NOW)
@@ -352,7 +351,7 @@ def test_a_change_goes_step_by_step_within_its_bounds_and_back_again() -> None:
 def test_a_size_that_nobody_believes_changes_nothing(ratio: float) -> None:
     for settings in (gain(mode="recommend"), gain(mode="recommend", exponent=None, value=25.0)):
         assert (
-            accommodate_fault("soft", settings, initial_tolerance_state(settings), "press 1", ratio, NOW, NOW)[1]
+            accommodate_fault("soft", settings, FaultToleranceState(settings.nominal), "press 1", ratio, NOW, NOW)[1]
             is None
         )
 
@@ -367,12 +366,14 @@ def test_an_executed_change_goes_through_a_sink_once_with_a_key(tmp_path: Path) 
     settings = ActionSettings.model_validate(section)
     soft = settings.tolerance["soft"]
     assert transition_entries(settings, NEW, "high", NOW) == ()
-    state, change, row = accommodate_fault("soft", soft, initial_tolerance_state(soft), "press 1", 0.9, NOW - 5.0, NOW)
+    state, change, row = accommodate_fault(
+        "soft", soft, FaultToleranceState(soft.nominal), "press 1", 0.9, NOW - 5.0, NOW
+    )
     assert change and row and change.executed
     assert change.reason == "pump at 0.9 of healthy"
     assert deliver(row, settings, NOW).delivered
     assert json.loads(kept.read_text())[0] == [str(kept), "k_p", repr(20.0 / 0.9), "20.0"]
-    assert accommodate_fault("soft", soft, initial_tolerance_state(soft), "press 1", 0.9, NOW - 5.0, NOW)[2] == row
+    assert accommodate_fault("soft", soft, FaultToleranceState(soft.nominal), "press 1", 0.9, NOW - 5.0, NOW)[2] == row
     _, _, back = accommodate_fault("soft", soft, state, "press 1", None, NOW, NOW)
     assert back and back.key != row.key
 

@@ -30,7 +30,7 @@ from servoscope.service.alarms import (
     notify_transition,
     step_alarm,
 )
-from servoscope.service.alarms.state_table import UNACKNOWLEDGED_STATES
+from servoscope.service.alarms.records import UNACKNOWLEDGED_STATES
 
 PUT_AWAY = (LifecycleState.SHELVED, LifecycleState.SUPPRESSED, LifecycleState.OUT_OF_SERVICE)
 VERDICTS = st.sampled_from(["healthy", "fault", "undetermined"])

@@ -26,7 +26,7 @@ from servoscope.service.alarms import (
     initial_alarm_state,
     step_alarm,
 )
-from servoscope.service.alarms.state_table import ReleaseCondition, next_state
+from servoscope.service.alarms.records import ReleaseCondition, next_state
 
 # The transition list, written down independently of the table: letters as in ISA-18.2, figure "Alarm state transition
 # diagram"; a dot where an event has no meaning; * is a release, which depends on what is found.

@@ -14,7 +14,7 @@ import pytest
 from brokers import until
 from inboxes import STUB
 
-from servoscope.service.mqtt.client import BrokerSettings, create_bulk_client
+from servoscope.service.mqtt.client import BrokerSettings, create_mqtt_client
 from servoscope.service.mqtt.paho_clients import GATHER_S, ReceivedMessage
 from servoscope.service.mqtt.payload import encode_binary
 from servoscope.service.mqtt.source import MqttSourceSettings
@@ -107,7 +107,7 @@ def test_messages_in_pieces_of_any_size_are_those_that_were_sent() -> None:
         broker = threading.Thread(target=serve, args=(server, pieces, received))
         broker.start()
         settings = BrokerSettings(host="127.0.0.1", port=server.getsockname()[1])
-        client = create_bulk_client(settings, Path(), "reader", came.append)
+        client = create_mqtt_client(settings, Path(), "reader", came.append)
         client.connect_async(*settings.address)
         client.loop_start()
         deadline = time.monotonic() + 60.0
@@ -159,7 +159,7 @@ def test_what_is_too_large_does_not_wait_in_memory() -> None:
 
 def test_the_socket_is_left_alone_until_a_share_of_its_buffer_is_full() -> None:
     """Otherwise a broker that sends faster than that in a pause would wait for us."""
-    client = create_bulk_client(BrokerSettings(host="127.0.0.1"), Path(), "reader", lambda one: None)
+    client = create_mqtt_client(BrokerSettings(host="127.0.0.1"), Path(), "reader", lambda one: None)
     with socket.socket() as one:
         one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2**17)
         room = one.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) / 4

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import datetime
 import ipaddress
-import json
 import socket
 import ssl
 import threading
@@ -97,9 +96,9 @@ def receiving(context: ssl.SSLContext | None = None, status: int = 200) -> Itera
 
 
 def attempt(url: str, folder: Path = Path(), **more: Any) -> tuple[bool, str]:
-    settings = ActionSettings.model_validate({"webhook": {"desk": {"url": url, **more}}}).resolve_paths(folder)
+    settings = ActionSettings.model_validate({"webhook": {"desk": {"url": url, **more}}})
     row = OutboxEntry("0", "desk", {"event": "occur"}, created=time.time(), due=0.0)
-    done = deliver(row, settings, time.time())
+    done = deliver(row, settings, time.time(), folder)
     return done.delivered, done.detail
 
 
@@ -285,9 +284,13 @@ def test_the_section_holds_for_all_that_have_no_rules_of_their_own(tmp_path: Pat
 
 def test_the_files_of_a_broker_of_an_action_lie_beside_the_service_file(tmp_path: Path) -> None:
     message = {"broker": {"host": "a", "user": "u", "password_file": "p", "ca_file": "c"}, "topic": "t"}
-    one = ActionSettings.model_validate({"mqtt": {"bell": message}}).resolve_paths(tmp_path).mqtt["bell"].broker
-    assert (one.password_file, one.ca_file) == (str(tmp_path / "p"), str(tmp_path / "c"))
-    assert json.loads(one.model_dump_json())["host"] == "a"
+    settings = ActionSettings.model_validate({"mqtt": {"bell": message}})
+    row = OutboxEntry("0", "bell", {"event": "occur"}, created=time.time(), due=0.0)
+    assert str(tmp_path / "p") in deliver(row, settings, time.time(), tmp_path).detail
+    (tmp_path / "p").write_text("hush")
+    assert "certificates are given" in deliver(row, settings, time.time(), tmp_path).detail
+    with pytest.raises(ConfigError, match="certificates cannot be used"):
+        settings.mqtt["bell"].broker.create_tls_context(tmp_path, "a")
 
 
 @pytest.mark.parametrize(

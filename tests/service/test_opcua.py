@@ -24,11 +24,10 @@ from reliability.servers import Cable
 
 from servoscope.core.errors import ConfigError, MessageError
 from servoscope.service.opcua import server as opcua_server
-from servoscope.service.opcua.monitored_items import _AnswerRecorder
 from servoscope.service.opcua.server import OpcuaServer, OpcuaServerSettings
 from servoscope.service.opcua.settings import OpcuaNodes
 from servoscope.service.opcua.source import OpcuaSourceSettings
-from servoscope.service.opcua.subscriptions import parse_block, parse_value, read_history
+from servoscope.service.opcua.subscriptions import _AnswerRecorder, parse_block, parse_value, read_history
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.inbox import Inbox
 from servoscope.service.sources.message import SourceAsset

@@ -16,15 +16,14 @@ from oidc_provider import found_node
 from test_opcua import certificate, free_port, source_assets
 
 from servoscope.core.errors import ConfigError
-from servoscope.service.opcua.monitored_items import ItemGrant
 from servoscope.service.opcua.settings import OpcuaNodes, describe_expiry
 from servoscope.service.opcua.source import OpcuaSourceSettings
-from servoscope.service.opcua.subscriptions import ScalarSubscription
+from servoscope.service.opcua.subscriptions import ItemTerms, ScalarSubscription
+from servoscope.service.sources.assembly import STEPS, UpdateRate
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.inbox import Inbox
 from servoscope.service.sources.message import RejectionCounter
 from servoscope.service.sources.resample import Resampler
-from servoscope.service.sources.update_rate import STEPS, UpdateRate
 
 SERVER = Path(__file__).parents[1] / "support" / "opcua_server" / "plant.js"
 RATE = 20.0
@@ -93,7 +92,7 @@ def test_what_comes_too_slowly_is_told_and_makes_no_samples(plant: ForeignPlant)
     source.close()
 
 
-def subscription(**grants: ItemGrant) -> tuple[ScalarSubscription, list[Block], float]:
+def subscription(**grants: ItemTerms) -> tuple[ScalarSubscription, list[Block], float]:
     """Return r, u and y at 100 Hz with what a server grants of them, and the longest publishing interval for that."""
     made: list[Block] = []
     one = ScalarSubscription("press", list(grants), ResumePosition(-1, 0.0), made.append, RejectionCounter(), 100.0, 50)
@@ -102,12 +101,12 @@ def subscription(**grants: ItemGrant) -> tuple[ScalarSubscription, list[Block], 
 
 
 def test_short_queues_ask_for_sooner_messages_and_else_are_told() -> None:
-    granted = ItemGrant(10.0, 40)
+    granted = ItemTerms(10.0, 40)
     assert subscription(r=granted, u=granted, y=granted)[0].trouble is None
-    short, _, longest = subscription(r=granted, u=ItemGrant(10.0, 8), y=granted)
+    short, _, longest = subscription(r=granted, u=ItemTerms(10.0, 8), y=granted)
     assert longest == pytest.approx(0.08)
     assert short.trouble is not None and "the server keeps 8 values of u" in short.trouble.why
-    short.check_grants({"r": granted, "u": ItemGrant(10.0, 8), "y": granted}, 0.04)  # the server has agreed to that
+    short.check_grants({"r": granted, "u": ItemTerms(10.0, 8), "y": granted}, 0.04)  # the server has agreed to that
     assert short.trouble is None
 
 

@@ -29,7 +29,7 @@ from servoscope.diagnosis.monitor import Monitor
 from servoscope.service.actions import ActionSettings
 from servoscope.service.alarms import AlarmSettings
 from servoscope.service.assets.asset import Asset, AssetPolicy
-from servoscope.service.assets.reception import AssetTrouble, ReceptionLog
+from servoscope.service.assets.reception import Reception, ReceptionLog
 from servoscope.service.build import build_components
 from servoscope.service.config import DiagnosisSettings, ServiceFile
 from servoscope.service.health import serve_health
@@ -119,7 +119,7 @@ def test_how_an_asset_is_heard() -> None:
     log.hear(4.0)
     assert log.evaluate(14.0, 10.0, "a passing trouble", None).state == "followed"
     assert log.evaluate(14.1, 10.0, "", None).state == "silent"
-    assert log.evaluate(5.0, 10.0, "", AssetTrouble("slow", "u comes every 50 ms, the loop needs 10")).state == "slow"
+    assert log.evaluate(5.0, 10.0, "", Reception("slow", "u comes every 50 ms, the loop needs 10")).state == "slow"
 
 
 def example(name: str, port: int) -> str:

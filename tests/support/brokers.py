@@ -16,13 +16,13 @@ from inboxes import STUB
 from reliability.servers import Mosquitto, mosquitto
 
 from servoscope.service.assets.checkpoint import StreamPosition
+from servoscope.service.assets.records import check_continuity
 from servoscope.service.mqtt import payload
 from servoscope.service.mqtt.client import BrokerSettings, create_mqtt_client
 from servoscope.service.mqtt.replay_client import ReplayClient, ReplayClientSettings
 from servoscope.service.mqtt.source import MqttSourceSettings
 from servoscope.service.service import Service
 from servoscope.service.sources.block import Block, ResumePosition
-from servoscope.service.sources.continuity import check_continuity
 from servoscope.service.sources.inbox import Inbox
 
 BEGAN = 1767225600.0  # 2026-01-01T00:00:00Z

@@ -6,6 +6,7 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from servoscope.cli import (  # their commands add themselves to the application
+    add,
     alarms,
     assess,
     baseline,
@@ -26,6 +27,7 @@ from servoscope.cli.app import app, group_commands, main
 group_commands()
 
 __all__ = [
+    "add",
     "alarms",
     "app",
     "assess",

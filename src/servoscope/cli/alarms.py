@@ -12,7 +12,7 @@ from servoscope.cli.app import app
 from servoscope.cli.arguments import parse_duration
 from servoscope.cli.exit import print_json
 from servoscope.cli.options import JsonOption, ReasonOption, UserOption
-from servoscope.cli.service import AssetOption, StoreArgument, check_assets, open_store
+from servoscope.cli.service import AssetOption, StoreArgument, open_store
 from servoscope.core.errors import AlarmError
 from servoscope.core.messages import message
 
@@ -32,9 +32,7 @@ def print_alarms(store: StoreArgument, asset: AssetOption = None, as_json: JsonO
     """List the alarms that are not normal."""
     from servoscope.cli.render import history, results
 
-    opened = open_store(store)
-    check_assets(opened, asset or ())
-    active = history.active_alarms(opened.statuses(asset))
+    active = history.active_alarms(open_store(store, asset or ()).statuses(asset))
     if as_json:
         print_json(active, lines=False)
     else:
@@ -80,8 +78,7 @@ def send_command(
     store: str, asset: str, alarm: str, command: str, who: str | None, reason: str, for_s: float | None = None
 ) -> None:
     """Write a command into the store, and wait a little for the service to execute it."""
-    opened = open_store(store)
-    check_assets(opened, [asset])
+    opened = open_store(store, [asset])
     number = opened.add_command(who or getpass.getuser(), asset, alarm, command, reason=reason, for_s=for_s)
     deadline = time.monotonic() + COMMAND_TIMEOUT_S
     while (outcome := opened.command_outcome(number)) is None and time.monotonic() < deadline:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from servoscope.cli.exit import EXIT_FAULT, FailureCounter, print_json
-from servoscope.cli.output_paths import OutputPaths, recording_stem
+from servoscope.cli.output_paths import OutputPaths
 
 if TYPE_CHECKING:
     from servoscope.baseline.arm import ArmBaseline
@@ -69,7 +69,7 @@ def diagnose_logs(
     """Diagnose logs of an arm, print the verdicts, and write reports on them."""
     from servoscope.cli.render import diagnosis, results
     from servoscope.diagnosis.arm import examine_arm
-    from servoscope.report import plain_values
+    from servoscope.report import document, plain_values
     from servoscope.report.arm_page import write_arm_page
     from servoscope.signals.readers.arm_log import read_arm_log
 
@@ -83,11 +83,11 @@ def diagnose_logs(
             if as_json:
                 print_json(plain_values.to_plain_values(result), lines=len(logs) > 1)
             else:
-                diagnosis.print_diagnosis(results.create_console(), result, details)
+                diagnosis.print_diagnosis(
+                    results.create_console(), result, document.DETAILS if details else document.EVIDENCE
+                )
             if pages is not None:
-                target = pages.path(recording_stem(path, recording.name))
-                write_arm_page(target, result, examination, baseline)
-                results.print_written_path(results.create_console(stderr=as_json), target)
+                pages.write(path, recording.name, write_arm_page, result, examination, baseline, stderr=as_json)
     if fail_on_fault and faulty:
         raise typer.Exit(EXIT_FAULT)
     failures.exit_if_any()

@@ -14,7 +14,7 @@ from servoscope.cli import arguments
 from servoscope.cli.app import app
 from servoscope.cli.exit import FailureCounter, print_json
 from servoscope.cli.options import JsonOption, ReadingOptions, ReportOption, with_reading_options
-from servoscope.cli.output_paths import REPORTS, OutputPaths, check_output, recording_stem
+from servoscope.cli.output_paths import REPORTS, OutputPaths, check_output
 from servoscope.cli.progress import show_steps
 
 if TYPE_CHECKING:
@@ -63,10 +63,8 @@ def assess(
                     result = assess_log(samples, name=name, travel=limits)
                     judged.append(result)
                     if pages is not None:
-                        target = pages.path(recording_stem(path, name))
-                        assessment_page.write_assessment_page(target, result)
                         with steps.pause():
-                            results.print_written_path(results.create_console(stderr=as_json), target)
+                            pages.write(path, name, assessment_page.write_assessment_page, result, stderr=as_json)
     ranked = plant_loops.rank(judged)
     if as_json:
         for result in ranked:

@@ -14,6 +14,7 @@ EXAMPLES = {
     "baseline back": "servoscope baseline back baseline.json --why 'it was not run in yet'",
     "diagnose": "servoscope diagnose baseline.json friday.csv --report friday.html",
     "verify": "servoscope verify friday.json friday.csv baseline.json",
+    "add": "servoscope add hall.toml press baseline.json --source line",
     "run": "servoscope run hall.toml",
     "watch": "servoscope watch hall.toml",
     "history": "servoscope history hall.toml --asset press",

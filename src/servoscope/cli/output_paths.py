@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import typer
@@ -74,6 +74,16 @@ class OutputPaths:
     def from_option(cls, target: Path | None, suffix: str, many: bool, inputs: Sequence[Path]) -> OutputPaths | None:
         """Return where results go; None without the option."""
         return None if target is None else cls(target, suffix, many, inputs)
+
+    def write(
+        self, log: Path, recording: str, write: Callable[..., object], *contents: object, stderr: bool = False
+    ) -> None:
+        """Let `write` write what belongs to a recording of a log, and say where; on stderr beside JSON."""
+        from servoscope.cli.render import results
+
+        target = self.path(recording_stem(log, recording))
+        write(target, *contents)
+        results.print_written_path(results.create_console(stderr=stderr), target)
 
     def path(self, stem: str) -> Path:
         """Return the file for the next recording; makes the folder if there is to be one.

@@ -21,7 +21,7 @@ from servoscope.cli.options import (
     UserOption,
     with_reading_options,
 )
-from servoscope.cli.output_paths import REPORTS, TRACES, OutputPaths, check_output, recording_stem
+from servoscope.cli.output_paths import REPORTS, TRACES, OutputPaths, check_output
 from servoscope.cli.progress import show_steps
 
 if TYPE_CHECKING:
@@ -73,9 +73,14 @@ def inspect(
                             results.print_inspection(out, result)
                     if pages is not None:
                         with failures.catch():
-                            target = pages.path(recording_stem(path, recording.name))
-                            inspection_page.write_inspection_page(target, result, recording)
-                            results.print_written_path(results.create_console(stderr=as_json), target)
+                            pages.write(
+                                path,
+                                recording.name,
+                                inspection_page.write_inspection_page,
+                                result,
+                                recording,
+                                stderr=as_json,
+                            )
     failures.exit_if_any()
 
 
@@ -246,7 +251,7 @@ def diagnose(
     from servoscope.diagnosis.diagnose import diagnose as diagnose_recording
     from servoscope.diagnosis.diagnose import diagnose_with_trace
     from servoscope.diagnosis.verify import provenance
-    from servoscope.report import plain_values, write_diagnosis_page
+    from servoscope.report import document, plain_values, write_diagnosis_page
     from servoscope.signals.writers import write_table
 
     if (of_arm := ArmBaseline.load(baseline)) is not None:
@@ -279,18 +284,16 @@ def diagnose(
                             if as_json:
                                 print_json(plain_values.to_plain_values(result), lines=several)
                             else:
-                                diagnosis.print_diagnosis(out, result, details)
-                        stem = recording_stem(path, recording.name)
+                                diagnosis.print_diagnosis(
+                                    out, result, document.DETAILS if details else document.EVIDENCE
+                                )
                         if traces is not None and course is not None:
-                            target = traces.path(stem)
-                            write_table(target, course.table())
-                            results.print_written_path(results.create_console(stderr=as_json), target)
+                            traces.write(path, recording.name, write_table, course.table(), stderr=as_json)
                         if pages is not None and course is not None:
-                            target = pages.path(stem)
                             at = learned.at(result.point) if result.point else learned
                             origin = plain_values.provenance(at, baseline, path)
-                            write_diagnosis_page(target, result, course, recording, at.loop, origin)
-                            results.print_written_path(results.create_console(stderr=as_json), target)
+                            page = result, course, recording, at.loop, origin
+                            pages.write(path, recording.name, write_diagnosis_page, *page, stderr=as_json)
     if fail_on_fault and faulty:
         raise typer.Exit(EXIT_FAULT)
     failures.exit_if_any()

@@ -37,14 +37,13 @@ def relearn(
     """Learn an asset's baseline anew from the samples that the store keeps: a preview, and with --yes in force."""
     from servoscope.baseline.baseline import Baseline
     from servoscope.cli.render import results
-    from servoscope.cli.service import check_assets, open_store
+    from servoscope.cli.service import open_store
     from servoscope.diagnosis.relearn import relearn as learn_anew
     from servoscope.service import relearning
     from servoscope.service.assets.status import AssetStatus
     from servoscope.service.config import ServiceFile
 
-    settings, store = ServiceFile.load(config), open_store(str(config))
-    check_assets(store, [asset])
+    settings, store = ServiceFile.load(config), open_store(str(config), [asset])
     status = AssetStatus.model_validate(store.statuses([asset])[asset]["status"])
     t, who, path = status.position.t, who or getpass.getuser(), settings.baseline_file(asset)
     before = Baseline.load(path)

@@ -144,7 +144,7 @@ def watch(
     from servoscope.cli.render import history as tables
     from servoscope.cli.render import results
 
-    opened, out = open_store(store), results.create_console()
+    opened, out = open_store(store, asset or ()), results.create_console()
 
     def page() -> Group:
         try:
@@ -152,7 +152,6 @@ def watch(
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise StoreError(f"{store}: holds a damaged status ({error!r}), restore a backup of the store") from None
 
-    check_assets(opened, asset or ())
     if as_json:
         print_json(list(opened.statuses(asset).values()), lines=False)
     elif once:
@@ -194,8 +193,7 @@ def history(
     from servoscope.service.store.queries import query_history, with_time_text
 
     shown = last if last is not None or as_json or output is not None else DEFAULT_ROWS
-    opened = open_store(store)
-    check_assets(opened, asset or ())
+    opened = open_store(store, asset or ())
     rows = query_history(opened, kind, assets=asset or (), span=span, last=shown)
     if output is not None:
         export_rows(output, rows)
@@ -245,19 +243,19 @@ def parse_store_address(text: str) -> tuple[str, Path | None]:
     return config.store.url, config.folder
 
 
-def open_store(text: str) -> Store:
-    """Open a store for reading, by a service file or by itself; a locked one is waited for."""
+def open_store(text: str, assets: Sequence[str] = ()) -> Store:
+    """Open a store for reading, by a service file or by itself; a locked one is waited for.
+
+    Raises StoreError if it lacks one of the assets: an empty answer would look as if all were well.
+    """
     from servoscope.service.store import Store
 
-    return Store.open(*parse_store_address(text), lock_timeout_s=5.0)
-
-
-def check_assets(store: Store, assets: Sequence[str]) -> None:
-    """Refuse assets that are not in the store: an empty answer would look as if all were well."""
+    store = Store.open(*parse_store_address(text), lock_timeout_s=5.0)
     known = store.statuses() if assets else {}
     for name in assets:
         if name not in known:
             raise StoreError(f"{name}: no such asset in {store.name}, {suggest_name(name, known)}")
+    return store
 
 
 def export_rows(path: Path, rows: list[Any]) -> None:

@@ -68,14 +68,12 @@ def trend(
             Path(source), value, time=time, std=std, interval=interval, covariates=covariate or (), after=begin
         )
     else:
-        from servoscope.cli.service import check_assets, open_store
+        from servoscope.cli.service import open_store
         from servoscope.service.store.series import query_sizes
 
         if asset is None:
             raise typer.BadParameter(f"{source}: name the asset: --asset NAME")
-        store = open_store(source)
-        check_assets(store, [asset])
-        series = query_sizes(store, asset, value, begin)
+        series = query_sizes(open_store(source, [asset]), asset, value, begin)
     found = prognose(series, _find_limit(limit, loop, series, source, asset), coverage)
     if as_json:
         print_json(found.model_dump(mode="json", exclude={"headline", "reasons"}), lines=False)

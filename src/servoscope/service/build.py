@@ -288,14 +288,13 @@ def check_actions(config: ServiceFile, assets: Mapping[str, Asset]) -> None:
 
     Raises ConfigError if one of them does not exist: alarms would not be sent, which would go unnoticed.
     """
-    settings = config.actions.resolve_paths(config.folder)
     for kind in SINKS:
-        for name, sink in getattr(settings, kind).items():
+        for name, sink in getattr(config.actions, kind).items():
             where = f"[actions] {kind}.{name}"
             _check_names(f"{where}.assets", "asset", sink.assets or (), [*assets, config.name])
             _check_names(f"{where}.alarms", "alarm", sink.alarms or (), config.alarms.definitions)
-            _check_sink(where, sink)
-    for name, one in settings.tolerance.items():
+            _check_sink(where, sink, config.folder)
+    for name, one in config.actions.tolerance.items():
         where = f"[actions] tolerance.{name}"
         _check_names(f"{where}.assets", "asset", one.assets, assets)
         for asset in one.assets:
@@ -306,17 +305,17 @@ def check_actions(config: ServiceFile, assets: Mapping[str, Asset]) -> None:
             _check_names(f"{where}.fault", f"fault of {asset}", [one.fault], faults)
 
 
-def _check_sink(where: str, sink: Sink) -> None:
+def _check_sink(where: str, sink: Sink, folder: Path) -> None:
     if isinstance(sink, WebhookSettings | EmailSettings):
         try:
-            sink.load_secret(Path())
+            sink.load_secret(folder)
         except ConfigError as error:
             key = "secret_env" if sink.secret_env is not None else "secret_file"
             raise ConfigError(f"{where}.{key}: {error}") from None
         if sink.has_certificates:
-            sink.create_tls_context(Path(), where)
-    elif isinstance(sink, CommandSettings) and shutil.which(sink.argv[0]) is None:
-        raise ConfigError(f"{where}.argv: there is no program {sink.argv[0]} that can be run, give its path")
+            sink.create_tls_context(folder, where)
+    elif isinstance(sink, CommandSettings) and shutil.which(program := sink.program(folder)) is None:
+        raise ConfigError(f"{where}.argv: there is no program {program} that can be run, give its path")
 
 
 def _check_names(where: str, kind: str, names: Collection[str], known: Collection[str]) -> None:

@@ -108,11 +108,13 @@ class FileSettings(Settings):
     @classmethod
     def load(cls, path: str | Path) -> Self:
         """Read a file; raises ConfigError if it cannot be read, is not TOML, or a key in it is wrong."""
-        path = Path(path)
+        return cls.parse(read_toml_text(Path(path), cls.kind_of_file, ConfigError), Path(path))
+
+    @classmethod
+    def parse(cls, text: str, path: Path) -> Self:
+        """Return what a text says that is the file of a path, or will be; raises ConfigError as `load` does."""
         try:
-            found = cls.model_validate(
-                parse_toml(read_toml_text(path, cls.kind_of_file, ConfigError), path, ConfigError)
-            )
+            found = cls.model_validate(parse_toml(text, path, ConfigError))
         except ValidationError as error:
             raise ConfigError(f"{path}: {describe_error(error, cls)}") from None
         found._file = path.absolute()

@@ -186,7 +186,7 @@ class Notifier:
                 continue
             ratio = faults[0]["ratio"] if faults and faults[0]["name"] == settings.fault else None
             key = f"{name}@{asset}"
-            state = self._tolerance.get(key) or actions.initial_tolerance_state(settings)
+            state = self._tolerance.get(key) or FaultToleranceState(settings.nominal)
             self._tolerance[key], change, entry = actions.accommodate_fault(name, settings, state, asset, ratio, t, now)
             if change is not None:
                 rows.append(audit_row("change executed" if change.executed else "change recommended", change.to_dict()))

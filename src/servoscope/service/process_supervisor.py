@@ -1,8 +1,9 @@
-"""Keeps a process of its own running beside this one, and starts it again when it ends."""
+"""Who keeps processes running: we one beside this, started again when it ends, and systemd this one."""
 
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 import threading
@@ -118,3 +119,15 @@ def call_at_end_of_stdin(stop: Callable[[], None]) -> None:
         stop()
 
     threading.Thread(target=wait, name="parent", daemon=True).start()
+
+
+def notify_systemd(*lines: str) -> None:
+    """Send lines such as ``READY=1``, as sd_notify(3) says; without systemd nothing happens."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address:
+        return
+    path = "\0" + address[1:] if address.startswith("@") else address
+    # a supervisor that does not listen must not stop the service
+    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
+        sender.setblocking(False)
+        sender.sendto("\n".join(lines).encode(), path)

@@ -29,10 +29,10 @@ from servoscope.service.health import HealthReport
 from servoscope.service.housekeeping import Housekeeping
 from servoscope.service.log import log, set_level
 from servoscope.service.metrics import ServiceMetrics
+from servoscope.service.process_supervisor import notify_systemd
 from servoscope.service.reload import reload_components
 from servoscope.service.sources.block import Block
 from servoscope.service.sources.inbox import Inbox
-from servoscope.service.systemd import notify_systemd
 from servoscope.service.writer import StoreWriter
 
 MAX_BLOCKS_PER_POLL = 1024  # blocks of one source that are processed before it is another one's turn
@@ -53,8 +53,7 @@ class Service:
         self.writer = StoreWriter(self.store, config.name, config.service.buffer)
         self.metrics = ServiceMetrics(self)
         self.clock = SteadyClock(monotonic)
-        actions = config.actions.resolve_paths(config.folder)
-        self.dispatcher = OutboxDispatcher(self.store, config.name, actions, self.clock)
+        self.dispatcher = OutboxDispatcher(self.store, config.name, config.actions, self.clock, config.folder)
         self._diagnosis_worker = DiagnosisWorker()
         self._diagnosis_jobs: dict[tuple[str, PendingDiagnosis], Future[StoredDiagnosis]] = {}
         self._prognosis_jobs: dict[str, Future[Prognosis]] = {}
@@ -153,7 +152,7 @@ class Service:
         self._take_components(config, components)
         self.writer.capacity = config.service.buffer
         set_level(config.service.log)
-        self.dispatcher.change(config.actions.resolve_paths(config.folder))
+        self.dispatcher.change(config.actions)
         # a diagnosis that is still due is asked for again
         jobs = self._diagnosis_jobs.items()
         self._diagnosis_jobs = {key: job for key, job in jobs if self.assets.get(key[0]) is before[key[0]]}

@@ -19,9 +19,8 @@ from servoscope.service.build import check_restarted, check_service_file
 from servoscope.service.config import ServiceFile
 from servoscope.service.health import STALL_S, HealthReport
 from servoscope.service.log import log
-from servoscope.service.process_supervisor import ProcessSupervisor
+from servoscope.service.process_supervisor import ProcessSupervisor, notify_systemd
 from servoscope.service.store import Store
-from servoscope.service.systemd import notify_systemd
 
 POLL_INTERVAL_S = 1.0
 ANSWER_S = 5.0  # in which a worker answers

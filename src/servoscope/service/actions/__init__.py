@@ -10,7 +10,6 @@ from servoscope.service.actions.fault_tolerance import (
     ControlChange,
     FaultToleranceState,
     accommodate_fault,
-    initial_tolerance_state,
 )
 from servoscope.service.actions.outbox import (
     DeliveryAttempt,
@@ -34,6 +33,6 @@ __all__ = [
     "ActionSettings", "CommandSettings", "ControlChange", "DeliveryAttempt", "EmailSettings",
     "FaultToleranceSettings",
     "FaultToleranceState", "MqttMessageSettings", "OutboxEntry", "RetrySettings", "WebhookSettings",
-    "accommodate_fault", "deliver", "diagnosis_entries", "flood_entries", "idempotency_key", "initial_tolerance_state",
+    "accommodate_fault", "deliver", "diagnosis_entries", "flood_entries", "idempotency_key",
     "signature", "transition_entries",
 ]  # fmt: skip

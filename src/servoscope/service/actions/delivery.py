@@ -46,22 +46,24 @@ class _DeliveryError(Exception):
         self.min_wait_s = min_wait_s
 
 
-def deliver(row: OutboxEntry, settings: ActionSettings, now: float) -> DeliveryAttempt:
-    """Try once to deliver an entry that is due, now (epoch, s).
+def deliver(row: OutboxEntry, settings: ActionSettings, now: float, folder: Path = Path()) -> DeliveryAttempt:
+    """Try once to deliver an entry that is due, now (epoch, s); the paths of sinks are relative to a folder.
 
     It blocks for up to the sink's `timeout_s`, and raises nothing.
     """
-    return deliver_together([row], settings, now)[0]
+    return deliver_together([row], settings, now, folder)[0]
 
 
-def deliver_together(rows: Sequence[OutboxEntry], settings: ActionSettings, now: float) -> list[DeliveryAttempt]:
+def deliver_together(
+    rows: Sequence[OutboxEntry], settings: ActionSettings, now: float, folder: Path
+) -> list[DeliveryAttempt]:
     """Do what `deliver` does for entries of one sink at once; only a mail takes several."""
     name = rows[0].sink
     sink = settings.sinks.get(name)
     try:
         if sink is None:
             raise _DeliveryError(f"none of {SINK_NAMES} is called {name!r} any more")
-        outcome, failure = _send(rows, sink), None
+        outcome, failure = _send(rows, sink, folder), None
     except _DeliveryError as error:
         outcome, failure = _shorten(hide_secrets(str(error))), error
     return [
@@ -83,33 +85,33 @@ def signature(secret: bytes, timestamp: str, body: bytes) -> str:
     return "sha256=" + hmac.new(secret, timestamp.encode() + b"." + body, hashlib.sha256).hexdigest()
 
 
-def _send(rows: Sequence[OutboxEntry], sink: Sink) -> str:
+def _send(rows: Sequence[OutboxEntry], sink: Sink, folder: Path) -> str:
     row = rows[0]
-    match sink:
-        case WebhookSettings():
-            return _post(row, sink)
-        case CommandSettings():
-            return _run_command(row, sink)
-        case MqttMessageSettings():
-            return _publish(row, sink)
-        case EmailSettings():
-            return _mail(rows, sink)
-
-
-def _mail(rows: Sequence[OutboxEntry], sink: EmailSettings) -> str:
     try:
-        secret = sink.load_secret(Path())
-        return send_mail(rows[0].key, [row.event for row in rows], sink, secret.decode() if secret else None)
+        match sink:
+            case WebhookSettings():
+                return _post(row, sink, folder)
+            case CommandSettings():
+                return _run_command(row, sink, folder)
+            case MqttMessageSettings():
+                return _publish(row, sink, folder)
+            case EmailSettings():
+                return _mail(rows, sink, folder)
+    except ConfigError as error:
+        raise _DeliveryError(str(error)) from None
+
+
+def _mail(rows: Sequence[OutboxEntry], sink: EmailSettings, folder: Path) -> str:
+    try:
+        secret = sink.load_secret(folder)
+        return send_mail(rows[0].key, [row.event for row in rows], sink, secret.decode() if secret else None, folder)
     except (ValueError, OSError, ConfigError) as error:
         raise _DeliveryError(f"{sink.host}: {error}") from None
 
 
-def _publish(row: OutboxEntry, sink: MqttMessageSettings) -> str:
+def _publish(row: OutboxEntry, sink: MqttMessageSettings, folder: Path) -> str:
     host, port = sink.broker.address
-    try:
-        client = create_mqtt_client(sink.broker, Path(), "")
-    except ConfigError as error:
-        raise _DeliveryError(str(error)) from None
+    client = create_mqtt_client(sink.broker, folder, "")
     client.connect_timeout = sink.timeout_s
     try:
         client.connect(host, port)
@@ -127,24 +129,21 @@ def _publish(row: OutboxEntry, sink: MqttMessageSettings) -> str:
     return "taken by the broker"
 
 
-def _post(row: OutboxEntry, sink: WebhookSettings) -> str:
+def _post(row: OutboxEntry, sink: WebhookSettings, folder: Path) -> str:
     try:
         import httpx
     except ImportError:
         raise _DeliveryError("webhooks need httpx: pip install 'servoscope[service]'") from None
     body = json.dumps(row.event, allow_nan=False).encode()
     headers = {"Content-Type": "application/json", "Idempotency-Key": row.key}
-    try:
-        secret = sink.load_secret(Path())
-    except ConfigError as error:
-        raise _DeliveryError(str(error)) from None
+    secret = sink.load_secret(folder)
     if secret is not None:
         # by the clock of the machine, which receivers compare with theirs
         stamp = str(int(time.time()))
         headers |= {"X-Servoscope-Timestamp": stamp, "X-Servoscope-Signature": signature(secret, stamp, body)}
     loop = asyncio.new_event_loop()
     try:
-        status, wait = loop.run_until_complete(_request(sink, body, headers))
+        status, wait = loop.run_until_complete(_request(sink, folder, body, headers))
     except TimeoutError:
         raise _DeliveryError(f"{show_address(sink.url)}: timed out after {sink.timeout_s:g} s") from None
     except (httpx.HTTPError, httpx.InvalidURL, ConfigError, OSError) as error:
@@ -165,7 +164,7 @@ def _root_cause(error: BaseException) -> str:
     return str(error) or type(error).__name__
 
 
-async def _request(sink: WebhookSettings, body: bytes, headers: Mapping[str, str]) -> tuple[int, str]:
+async def _request(sink: WebhookSettings, folder: Path, body: bytes, headers: Mapping[str, str]) -> tuple[int, str]:
     """Return the status of the answer, and its Retry-After; raises TimeoutError after the sink's `timeout_s`.
 
     The limits of httpx hold for each read, of which a receiver that drips causes many.
@@ -173,7 +172,7 @@ async def _request(sink: WebhookSettings, body: bytes, headers: Mapping[str, str
     import httpx
 
     async with asyncio.timeout(sink.timeout_s):
-        target = await asyncio.to_thread(_checked_request, sink)
+        target = await asyncio.to_thread(_checked_request, sink, folder)
         # Redirects are not followed: the event goes where the configuration says, or nowhere. The answer's body is
         # not read: it might never end.
         async with (
@@ -195,7 +194,7 @@ class _Target(NamedTuple):
     trust_env: bool  # whether the proxies of the environment are used
 
 
-def _checked_request(sink: WebhookSettings) -> _Target:
+def _checked_request(sink: WebhookSettings, folder: Path) -> _Target:
     """Return where to send a request: with rules for networks to a numeric address, under the name it was found by.
 
     Raises OSError if there is no such address, or no permitted one.
@@ -203,7 +202,7 @@ def _checked_request(sink: WebhookSettings) -> _Target:
     import httpx
 
     url = httpx.URL(sink.url)
-    verify = sink.create_tls_context(Path(), url.host) if sink.has_certificates else True
+    verify = sink.create_tls_context(folder, url.host) if sink.has_certificates else True
     if sink.rules.internal:
         return _Target(url, {}, {}, verify, True)
     address = sink.rules.resolve(url.host, url.port or (443 if url.scheme == "https" else 80))
@@ -212,8 +211,8 @@ def _checked_request(sink: WebhookSettings) -> _Target:
     return _Target(url.copy_with(host=address), {"Host": url.netloc.decode()}, name, verify, False)
 
 
-def _run_command(row: OutboxEntry, sink: CommandSettings) -> str:
-    argv = [_fill_placeholder(argument, row) for argument in sink.argv]
+def _run_command(row: OutboxEntry, sink: CommandSettings, folder: Path) -> str:
+    argv = [sink.program(folder), *(_fill_placeholder(argument, row) for argument in sink.argv[1:])]
     body = json.dumps(row.event, allow_nan=False).encode()
     with tempfile.TemporaryFile() as errors:
         try:

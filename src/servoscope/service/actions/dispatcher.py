@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from queue import SimpleQueue
 
 from servoscope.core.errors import StoreError
@@ -21,10 +22,15 @@ MAX_ROWS_AS_ONE = 500  # of a sink that has been held
 
 
 class OutboxDispatcher:
-    """Delivers the outbox of one service, not that of others on the same store; the service stores the attempts."""
+    """Delivers the outbox of one service, not that of others on the same store; the service stores the attempts.
 
-    def __init__(self, store: Store, service: str, settings: ActionSettings, clock: SteadyClock) -> None:
-        self._store, self._service, self._settings, self._clock = store, service, settings, clock
+    The paths of sinks are relative to a folder.
+    """
+
+    def __init__(
+        self, store: Store, service: str, settings: ActionSettings, clock: SteadyClock, folder: Path = Path()
+    ) -> None:
+        self._store, self._service, self._settings, self._clock, self._folder = store, service, settings, clock, folder
         self._attempts: SimpleQueue[DeliveryAttempt] = SimpleQueue()
         self._in_progress: dict[tuple[str, int], str] = {}  # key and attempt -> sink, until the attempt is stored
         self._busy: set[str] = set()  # sinks that something is being delivered to
@@ -92,7 +98,7 @@ class OutboxDispatcher:
                 if wait_s:
                     self._held[sink] = time.monotonic() + wait_s
                     return
-                attempts = deliver_together(group, self._settings, self._clock.now())
+                attempts = deliver_together(group, self._settings, self._clock.now(), self._folder)
                 if attempts[0].delivered:
                     limit.count()
                 for attempt in attempts:

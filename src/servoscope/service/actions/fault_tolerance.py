@@ -42,11 +42,6 @@ class ControlChange(JsonRecord):
     reason: str  # the fault, and which limit holds the change back
 
 
-def initial_tolerance_state(settings: FaultToleranceSettings) -> FaultToleranceState:
-    """Return the state before the first change."""
-    return FaultToleranceState(settings.nominal)
-
-
 def accommodate_fault(
     name: str,
     settings: FaultToleranceSettings,

@@ -43,12 +43,12 @@ class HourlyLimit:
 class _MailServer(smtplib.SMTP):
     """A connection to where the rules for networks allow one, under the name that the certificate must have."""
 
-    def __init__(self, settings: EmailSettings, timeout_s: float) -> None:
+    def __init__(self, settings: EmailSettings, folder: Path) -> None:
         self._settings = settings
-        self._context = settings.create_tls_context(Path(), settings.host) if settings.encryption != "none" else None
+        self._context = settings.create_tls_context(folder, settings.host) if settings.encryption != "none" else None
         self._line: socket.socket | None = None  # what lies below any encryption
         self.is_cut = False
-        super().__init__(timeout=timeout_s)
+        super().__init__(timeout=settings.timeout_s)
 
     def _get_socket(self, host: str, port: int, timeout: float) -> socket.socket:
         connection = socket.create_connection((self._settings.rules.resolve(host, port), port), timeout)
@@ -88,13 +88,17 @@ class _MailServer(smtplib.SMTP):
             self._line.close()
 
 
-def send_mail(key: str, events: Sequence[dict[str, Any]], settings: EmailSettings, password: str | None) -> str:
+def send_mail(
+    key: str, events: Sequence[dict[str, Any]], settings: EmailSettings, password: str | None, folder: Path
+) -> str:
     """Send one mail about events, within `timeout_s`, and return what the server has made of it.
+
+    The paths of certificates are relative to a folder.
 
     Raises OSError or ConfigError if it has not taken the mail.
     """
     mail = compose_mail(key, events, settings)
-    server = _MailServer(settings, settings.timeout_s)
+    server = _MailServer(settings, folder)
     deadline = threading.Timer(settings.timeout_s, server.cut)  # a timeout of a socket starts again with each byte
     deadline.daemon = True
     deadline.start()

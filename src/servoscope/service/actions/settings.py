@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
@@ -34,7 +34,6 @@ PLACEHOLDERS = ("key", "time", "asset", "alarm", "event", "after", "priority", "
 
 SINKS = ("webhook", "command", "mqtt", "email")  # keys of the tables of those that are told
 SINK_NAMES = f"{', '.join(SINKS[:-1])} and {SINKS[-1]}"
-TLS_FILES = ("ca_file", "cert_file", "key_file")
 
 
 class RetrySettings(Settings):
@@ -102,6 +101,10 @@ class CommandSettings(SinkSettings):
         if value[0] in known:
             raise ValueError("the program must be named, not be a placeholder")
         return value
+
+    def program(self, folder: Path) -> str:
+        """Return what is run: a path is relative to a folder, a plain name stays one."""
+        return str(folder / self.argv[0]) if "/" in self.argv[0] else self.argv[0]
 
 
 class MqttMessageSettings(SinkSettings):
@@ -201,20 +204,6 @@ class ActionSettings(Settings):
                 raise ValueError(f"tolerance.{name}: sink: no webhook, command or mqtt is called {one.sink!r}")
         return self
 
-    def resolve_paths(self, folder: Path) -> ActionSettings:
-        """Return the same with the paths of programs and secrets relative to a folder; plain names stay names."""
-        command, mqtt = dict(self.command), dict(self.mqtt)
-        webhook = {name: _with_paths(one, folder, "secret_file", *TLS_FILES) for name, one in self.webhook.items()}
-        email = {name: _with_paths(one, folder, "secret_file", *TLS_FILES) for name, one in self.email.items()}
-        for name, message in mqtt.items():
-            broker = _with_paths(message.broker, folder, "password_file", *TLS_FILES)
-            mqtt[name] = message.model_copy(update={"broker": broker})
-        for name, tool in command.items():
-            if "/" in tool.argv[0]:
-                argv = (str(folder / tool.argv[0]), *tool.argv[1:])
-                command[name] = tool.model_copy(update={"argv": argv})
-        return self.model_copy(update={"webhook": webhook, "command": command, "mqtt": mqtt, "email": email})
-
     def with_network(self, network: NetworkSettings) -> ActionSettings:
         """Return the same with rules for those that have none of their own."""
         brokers = apply_network({name: one.broker for name, one in self.mqtt.items()}, network)
@@ -239,12 +228,3 @@ class ActionSettings(Settings):
     def sinks(self) -> dict[str, Sink]:
         """Webhooks, commands, messages and mails, by name."""
         return {name: sink for key in SINKS for name, sink in getattr(self, key).items()}
-
-
-S = TypeVar("S", bound=Settings)
-
-
-def _with_paths(settings: S, folder: Path, *names: str) -> S:
-    """Return settings in which these paths are relative to a folder."""
-    paths = {name: getattr(settings, name) for name in names}
-    return settings.model_copy(update={name: str(folder / path) for name, path in paths.items() if path is not None})

@@ -12,13 +12,22 @@ from servoscope.service.alarms.conditions import AssetSnapshot, Condition, evalu
 from servoscope.service.alarms.flood import FloodState, HeldAlarm, Notification, advance_flood, notify_transition
 from servoscope.service.alarms.lifecycle import (
     AlarmStandstill,
+    Ne107Status,
     advance_alarms,
+    evaluate_ne107,
     initial_alarm_state,
     next_event_time,
     step_alarm,
 )
-from servoscope.service.alarms.ne107 import Ne107Status, evaluate_ne107
-from servoscope.service.alarms.records import AlarmState, AlarmTransition, OperatorCommand
+from servoscope.service.alarms.records import (
+    COMMANDS,
+    TRANSITION_TABLE,
+    AlarmState,
+    AlarmTransition,
+    LifecycleEvent,
+    LifecycleState,
+    OperatorCommand,
+)
 from servoscope.service.alarms.settings import (
     DEFAULT_ALARMS,
     FAULT_ALARM,
@@ -30,7 +39,6 @@ from servoscope.service.alarms.settings import (
     Priority,
     alarm_kind,
 )
-from servoscope.service.alarms.state_table import COMMANDS, TRANSITION_TABLE, LifecycleEvent, LifecycleState
 
 __all__ = [
     "COMMANDS", "DEFAULT_ALARMS", "FAULT_ALARM", "PRIORITIES", "TRANSITION_TABLE", "AlarmDefinition", "AlarmSettings",

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
-from servoscope.service.alarms.records import AlarmTransition, PersistentState
+from servoscope.service.alarms.records import UNACKNOWLEDGED_STATES, AlarmTransition, PersistentState
 from servoscope.service.alarms.settings import PRIORITIES, FloodSettings, Priority
-from servoscope.service.alarms.state_table import UNACKNOWLEDGED_STATES
 
 
 @dataclass(frozen=True)

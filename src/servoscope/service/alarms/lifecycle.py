@@ -1,25 +1,30 @@
-"""The life-cycle of an alarm: its state is advanced by observations, time and commands; each transition is returned."""
+"""The life-cycle of an alarm: its state is advanced by observations, time and commands; each transition is returned.
+
+And the status of an asset after NAMUR NE 107, from its verdict, its data and its alarms.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 from servoscope.core.errors import AlarmError
 from servoscope.core.messages import message, render
 from servoscope.service.alarms.conditions import AssetSnapshot, describe_cause, evaluate_condition
-from servoscope.service.alarms.records import AlarmState, AlarmTransition, OperatorCommand
-from servoscope.service.alarms.settings import AlarmDefinition
-from servoscope.service.alarms.state_table import (
+from servoscope.service.alarms.records import (
     COMMANDS,
     LATCHED_STATES,
+    AlarmState,
+    AlarmTransition,
     LifecycleEvent,
     LifecycleState,
+    OperatorCommand,
     ReleaseCondition,
     next_state,
 )
+from servoscope.service.alarms.settings import AlarmDefinition, Ne107
 
 SYSTEM_USER = "system"  # where nobody commanded a transition
 EVENT_FLAGS: dict[LifecycleEvent, dict[str, Any]] = {  # what an event says of condition and design
@@ -29,6 +34,13 @@ EVENT_FLAGS: dict[LifecycleEvent, dict[str, Any]] = {  # what an event says of c
     LifecycleEvent.SUPPRESS: {"suppressed": True},
     LifecycleEvent.UNSUPPRESS: {"suppressed": False},
 }
+SEVERITY: tuple[Ne107, ...] = get_args(Ne107)  # from good to failure, as NE 107 (2017) ranks them
+NE107_OF_QUALITY: dict[str, Ne107] = {  # of a signal that does not come yet, that has failed, that is inaccurate
+    "waiting": "function_check",
+    **dict.fromkeys(("silent", "frozen_y", "frozen_u"), "failure"),
+    **dict.fromkeys(("gap", "jitter", "rate", "clock"), "out_of_specification"),
+}
+NE107_OF_VERDICT: dict[str, Ne107] = {"undetermined": "function_check", "fault": "maintenance_required"}
 
 
 def initial_alarm_state(asset: str, alarm: str, time: float) -> AlarmState:
@@ -181,3 +193,31 @@ def _shift_times(state: AlarmState, time: float) -> AlarmState:
     until = None if state.shelved_until is None else state.shelved_until - back
     since, condition_since = state.since - back, state.condition_since - back
     return replace(state, at=time, since=since, condition_since=condition_since, shelved_until=until)
+
+
+class Ne107Status(NamedTuple):
+    """The most severe status, and its reasons."""
+
+    ne107: Ne107
+    reasons: tuple[str, ...]
+
+
+def evaluate_ne107(
+    verdict: str, quality: Iterable[str], alarms: Iterable[tuple[AlarmDefinition, AlarmState]]
+) -> Ne107Status:
+    """Return the status of an asset from its verdict, the active findings of data quality, and all of its alarms.
+
+    An alarm that is shelved still counts, since shelving only silences it; one that its design suppresses does not;
+    one that is out of service means that somebody works on the asset.
+    """
+    found: list[tuple[Ne107, str]] = [(NE107_OF_QUALITY[kind], kind) for kind in quality]
+    if verdict in NE107_OF_VERDICT:
+        found.append((NE107_OF_VERDICT[verdict], verdict))
+    for definition, one in alarms:
+        if one.state is LifecycleState.OUT_OF_SERVICE:
+            found.append(("function_check", render(message("alarm.out_of_service", alarm=one.alarm))))
+        elif not one.suppressed and (one.active or one.state in LATCHED_STATES):
+            found.append((definition.ne107, one.alarm))
+    worst: Ne107 = max((status for status, _ in found), key=SEVERITY.index, default="good")
+    reasons = (reason for status, reason in found if status == worst and worst != "good")
+    return Ne107Status(worst, tuple(dict.fromkeys(reasons)))

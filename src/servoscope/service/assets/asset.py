@@ -36,12 +36,19 @@ from servoscope.service.assets.examination_schedule import (
 from servoscope.service.assets.outlook import AssetLimits, Outlook, PrognosisSettings, single_fault
 from servoscope.service.assets.recent_blocks import PackedBlock, RecentBlocks
 from servoscope.service.assets.reception import RECEPTION_OK, Reception
-from servoscope.service.assets.records import REPEATABLE_TABLES, BlockRefusal, StepResult, TableRow, transition_row
+from servoscope.service.assets.records import (
+    REPEATABLE_TABLES,
+    BlockRefusal,
+    NextBlock,
+    StepResult,
+    TableRow,
+    check_continuity,
+    transition_row,
+)
 from servoscope.service.assets.states import AssetStates, RestPeriod, StateHolder
 from servoscope.service.assets.status import AssetStatus, asset_metadata, asset_status
 from servoscope.service.config import DiagnosisSettings
 from servoscope.service.sources.block import Block
-from servoscope.service.sources.continuity import NextBlock, check_continuity
 from servoscope.service.store.bundles import pack_samples
 from servoscope.service.store.rows import coefficient_rows, fault_rows, period_number
 from servoscope.signals import quality
@@ -91,7 +98,7 @@ class Asset(StateHolder):
         from_s, to_s = self._alarms.standstill(state, self.reception)
         undisturbed = self.reception == RECEPTION_OK and not self._ticked
         rest = RestPeriod(state.examination.verdict == "fault", max(since, from_s), min(until, to_s))
-        self._move_to(states.put(row, state, rest if undisturbed else rest._replace(until=-math.inf)))
+        self._row = states.put(row, state, rest if undisturbed else rest._replace(until=-math.inf))
 
     @property
     def reception(self) -> Reception:
@@ -166,7 +173,7 @@ class Asset(StateHolder):
     def first_needed_sequence(self) -> int:
         """The number of the first block of the window: earlier ones are no longer needed."""
         first = self._window.first_sequence
-        return self._current.position.blocks if first is None else first
+        return self.take_state().position.blocks if first is None else first
 
     def process(self, block: Block, latest: float = math.inf) -> StepResult:
         """Process a block; one that was counted before has no effect, nor has one that is later than `latest` [UTC s].
@@ -187,10 +194,10 @@ class Asset(StateHolder):
             rows = self._state.position.rows if self._state is not None else 0
             self.begin(StreamPosition(start, start, stream=block.stream, rows=rows))
         if continuity is None:
-            position = self._current.position
+            position = self.take_state().position
             # its sender sends it again by design, or it is one of the last minutes
             if block.retained or self._window.begins_with(block.t[0]):
-                self.state = replace(self._current, position=replace(position, repeated=position.repeated + 1))
+                self.state = replace(self.take_state(), position=replace(position, repeated=position.repeated + 1))
                 return StepResult([], [])
             return self._leave_out(block, "late", behind_s=position.t - start)
         return NextBlock(block, continuity)
@@ -198,17 +205,17 @@ class Asset(StateHolder):
     def follow(self, accepted: NextBlock) -> Followed:
         """Follow an accepted block alone."""
         block, restart = accepted.block, accepted.continuity.is_broken
-        return self.lanes.follow(self.monitor, self._current, block.signals, restart=restart)
+        return self.lanes.follow(self.monitor, self.take_state(), block.signals, restart=restart)
 
     def conclude(self, accepted: NextBlock, followed: Followed) -> StepResult:
         """Take what an accepted block has led to."""
         before = self.take_state()
         self._count(accepted, followed)
         self._examine()
-        self._advance_alarms(self._current.position.t)
-        self._window.trim(self._current.position.t, self._current.pending_diagnoses)
+        self._advance_alarms(self.take_state().position.t)
+        self._window.trim(self.take_state().position.t, self.take_state().pending_diagnoses)
         undisturbed = self.reception == RECEPTION_OK and not self._ticked
-        after, self._ticked = self._current, False
+        after, self._ticked = self.take_state(), False
         nothing_else = after.alarms is before.alarms and after.examination is before.examination
         usual_rows = REPEATABLE_TABLES.issuperset(row.table for row in self._result.rows)
         return self._result._replace(repeatable=nothing_else and undisturbed and usual_rows)
@@ -253,7 +260,7 @@ class Asset(StateHolder):
         Raises AlarmError if there is no such alarm, or the command has no meaning in its state.
         """
         self._result = StepResult([], [])
-        self.state, transitions = self._alarms.execute(self._current, alarm, command)
+        self.state, transitions = self._alarms.execute(self.take_state(), alarm, command)
         self._add_transitions(transitions)
         return self._result
 
@@ -274,28 +281,31 @@ class Asset(StateHolder):
         ]
 
     def _carry_covariates(self, blocks: Sequence[Block]) -> Sequence[Block]:
-        state = self._current
+        state = self.take_state()
         history = self.monitor.covariate_history(state.monitor)
         return carry_covariates(self.baseline, blocks, history, state.position.t)
 
     def is_news(self, window: PendingDiagnosis, diagnosis: StoredDiagnosis) -> bool:
         """Return whether a full diagnosis is the first of its fault, or names others than the last one."""
-        names, known = fault_names(diagnosis.document.get("faults", [])), fault_names(self._current.examination.faults)
+        names, known = (
+            fault_names(diagnosis.document.get("faults", [])),
+            fault_names(self.take_state().examination.faults),
+        )
         return self._is_first_diagnosis(window) or bool(names and names != known)
 
     def _is_first_diagnosis(self, window: PendingDiagnosis) -> bool:
-        return window.until <= self._schedule.end(self._current.examination.since)
+        return window.until <= self._schedule.end(self.take_state().examination.since)
 
     def apply_prognosis(self, found: Prognosis) -> StepResult:
         """Keep a prognosis, and advance the alarms by it."""
-        state, self._result = self._current, StepResult([], [])
+        state, self._result = self.take_state(), StepResult([], [])
         self.state = replace(state, outlook=Outlook.from_prognosis(found, state.position.t))
         self._advance_alarms(state.position.t)
         return self._result
 
     def apply_diagnosis(self, window: PendingDiagnosis, diagnosis: StoredDiagnosis) -> StepResult:
         """Store the result of one of `due_diagnoses`; a second result for it has no effect."""
-        state = self._current
+        state = self.take_state()
         if window not in state.pending_diagnoses:
             return StepResult([], [])
         examination, diagnosis = accept_diagnosis(
@@ -304,17 +314,13 @@ class Asset(StateHolder):
         pending = tuple(one for one in state.pending_diagnoses if one != window)
         self.state = replace(state, examination=examination, pending_diagnoses=pending)
         values = {"number": window.number, "t": window.until, "grounds": window.why, **diagnosis.columns()}
-        self._window.trim(self._current.position.t, self._current.pending_diagnoses)
+        self._window.trim(self.take_state().position.t, self.take_state().pending_diagnoses)
         named = fault_rows(window.until, "full", diagnosis.document.get("faults", []))
         return StepResult([TableRow("diagnoses", values), *(TableRow("sizes", row) for row in named)], [])
 
-    @property
-    def _current(self) -> AssetState:
-        return self.take_state()
-
     def _next_row_number(self) -> int:
-        position = self._current.position
-        self.state = replace(self._current, position=replace(position, rows=position.rows + 1))
+        position = self.take_state().position
+        self.state = replace(self.take_state(), position=replace(position, rows=position.rows + 1))
         return position.rows + 1
 
     def _add_row(self, table: str, **values: Any) -> None:
@@ -325,7 +331,7 @@ class Asset(StateHolder):
 
     def _count(self, accepted: NextBlock, followed: Followed) -> None:
         """Keep a block and the state after it."""
-        (block, continuity, packed), state, (after, history) = accepted, self._current, followed
+        (block, continuity, packed), state, (after, history) = accepted, self.take_state(), followed
         position, (samples, regular) = state.position, packed or pack_samples(block.signals[None])[0]
         # stored under a number of our own, because the sender's may begin anew
         self._window.append((position.blocks, block.t.item(0), block.t.item(-1), block.t.size, samples, regular))
@@ -348,13 +354,13 @@ class Asset(StateHolder):
         )
         for row in history:
             self._add_row("residuals", **row)
-        evaluation = self._current.evaluation
+        evaluation = self.take_state().evaluation
         if evaluation.t is not None and period_number(evaluation.t) != period_number(state.evaluation.t):
             self._add_sizes(coefficient_rows(evaluation.t, evaluation.status.parameters))
 
     def _examine(self) -> None:
         """Examine the last minutes if that is due, and request a full diagnosis of a new fault."""
-        state, settings = self._current, self.policy.diagnosis
+        state, settings = self.take_state(), self.policy.diagnosis
         t, known = state.position.t, state.examination
         details = state.evaluation.features, single_fault(known.faults), known.verdict
         if is_at_rest(known, t, state.evaluation.exceeded):
@@ -380,12 +386,12 @@ class Asset(StateHolder):
         examination, in_full = schedule_full_diagnosis(examination, self._schedule, t)
         if in_full:
             window = PendingDiagnosis(self._next_row_number(), recent()[0].sequence, self._schedule.end(t), "full")
-            pending = (*self._current.pending_diagnoses, window)
-            self.state = replace(self._current, examination=examination, pending_diagnoses=pending)
+            pending = (*self.take_state().pending_diagnoses, window)
+            self.state = replace(self.take_state(), examination=examination, pending_diagnoses=pending)
 
     def _advance_alarms(self, t: float) -> None:
         """Update the alarms at time `t` [UTC s]."""
-        self.state, transitions = self._alarms.advance(self._current, self.reception, t)
+        self.state, transitions = self._alarms.advance(self.take_state(), self.reception, t)
         self._add_transitions(transitions)
 
     def _add_transitions(self, transitions: Sequence[AlarmTransition]) -> None:

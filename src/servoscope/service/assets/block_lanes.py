@@ -22,7 +22,7 @@ from servoscope.service.assets.residual_history import (
     known_excess,
     update_history,
 )
-from servoscope.service.layer_times import LayerTimes
+from servoscope.service.clock import LayerTimes
 from servoscope.signals import quality
 from servoscope.signals.timebase import MAX_TIME_S, Timebase
 

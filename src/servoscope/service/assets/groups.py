@@ -14,11 +14,10 @@ from servoscope.core.errors import ServoscopeError
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.service.assets.asset import Asset
 from servoscope.service.assets.recent_blocks import PackedBlock
-from servoscope.service.assets.records import StepResult, TableRow
+from servoscope.service.assets.records import NextBlock, StepResult, TableRow
 from servoscope.service.assets.states import AssetStates
-from servoscope.service.layer_times import LayerTimes
+from servoscope.service.clock import LayerTimes
 from servoscope.service.sources.block import Block
-from servoscope.service.sources.continuity import NextBlock
 from servoscope.service.store.bundles import pack_samples
 
 

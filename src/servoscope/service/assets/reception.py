@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 from servoscope.core.messages import message, render
 
@@ -13,16 +13,9 @@ ALARMED_STATES: tuple[ReceptionState, ...] = ("unheard", "slow", "refused")  # s
 MAX_TURN_S = 5.0  # between two polls: after a longer time the service was stopped
 
 
-class AssetTrouble(NamedTuple):
-    """What a source knows of an asset that it cannot follow, though it is connected."""
-
-    state: Literal["slow", "refused", "silent"]
-    why: str
-
-
 @dataclass(frozen=True)
 class Reception:
-    """The reception of one asset."""
+    """The reception of one asset; what a source says of one that it cannot follow, though it is connected."""
 
     state: ReceptionState
     why: str = ""  # in words; empty where it is followed
@@ -78,7 +71,7 @@ class ReceptionLog:
         """Return how long nothing could be used [s]."""
         return now - self._heard_at
 
-    def evaluate(self, now: float, patience_s: float, source_trouble: str, trouble: AssetTrouble | None) -> Reception:
+    def evaluate(self, now: float, patience_s: float, source_trouble: str, trouble: Reception | None) -> Reception:
         """Return the reception.
 
         `patience_s`: how long a pause may be [s]; `source_trouble`, `trouble`: what the source says of itself and of
@@ -88,7 +81,7 @@ class ReceptionLog:
         if source_trouble and not (self._heard and self.silence_s(now) <= patience_s):
             return Reception("silent" if self._heard else "unheard", source_trouble, source_down=True)
         if trouble is not None:
-            return Reception(*trouble)
+            return trouble
         if self._heard and self.silence_s(now) <= patience_s:
             return RECEPTION_OK
         if now - refused_at <= patience_s:

@@ -1,10 +1,13 @@
-"""Rows on their way to the store, and what they are made of."""
+"""What comes of a block: whether it is the next one, what is missing before it, and rows on their way to the store."""
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 from servoscope.service.alarms import AlarmDefinition, AlarmTransition
+from servoscope.service.assets.checkpoint import StreamPosition
+from servoscope.service.sources.block import Block
 
 # tables of what the samples and the state before them lead to, whenever and however often that is computed
 REPEATABLE_TABLES = frozenset({"recent", "residuals", "sizes"})
@@ -43,3 +46,48 @@ def transition_row(one: AlarmTransition, definition: AlarmDefinition) -> dict[st
     plain = one.to_dict()
     columns = {key: plain[key] for key in ("alarm", "before", "after", "cause", "who")}
     return {"t": one.time, **columns, "document": {"event": plain["event"], "priority": definition.priority}}
+
+
+class BlockContinuity(NamedTuple):
+    """How many blocks are missing before a new one, and whether it belongs to another stream."""
+
+    lost: int
+    anew: bool
+
+    @property
+    def is_broken(self) -> bool:
+        """Whether the block does not follow what was counted."""
+        return self.lost > 0 or self.anew
+
+    def audit_row(self, counted: StreamPosition, block: Block) -> TableRow:
+        """Return the line of the audit for a block that does not follow what was counted."""
+        streams = {"after": [counted.stream, counted.sequence], "before": [block.stream, block.sequence]}
+        return audit_row("blocks lost" if self.lost else "stream began anew", {"blocks": self.lost, **streams})
+
+
+class NextBlock(NamedTuple):
+    """A block that is to be followed, and how it follows what was counted."""
+
+    block: Block
+    continuity: BlockContinuity = BlockContinuity(0, anew=False)
+    packed: tuple[bytes, bool] | None = None  # its samples, if `pack_samples` has packed them
+
+
+def check_continuity(counted: StreamPosition | None, block: Block, latest: float = math.inf) -> BlockContinuity | None:
+    """Return how a block follows what was counted; None: it was counted before, or its place has passed.
+
+    Numbers of a named stream begin at 0, and a later stream has a greater name. A stream without a name is accepted
+    from any number on; where its numbers fall back while its time goes on, its sender has restarted. `latest`: the
+    last time that can be true [UTC s].
+    """
+    if counted is None:
+        return BlockContinuity(block.sequence if block.stream else 0, False)
+    if block.stream == counted.stream and block.sequence > counted.sequence:
+        return BlockContinuity(block.sequence - counted.sequence - 1, False)
+    if counted.t > latest:  # it was counted by a clock that was wrong: whatever comes now begins anew behind it
+        return BlockContinuity(0, True)
+    if block.stream > counted.stream:
+        return BlockContinuity(block.sequence, True)
+    if not block.retained and block.t[0] > counted.t:
+        return BlockContinuity(0, True)
+    return None

@@ -71,19 +71,6 @@ class StateRow(NamedTuple):
     states: AssetStates
     row: int
 
-    @property
-    def t(self) -> float:
-        """Time of its last sample [UTC s]."""
-        return float(self.states.t[self.row])
-
-    def read(self, before: AssetState) -> AssetState:
-        """Return the state; `before`: when it came here."""
-        return self.states.read(self.row, before)
-
-    def leave(self) -> None:
-        """Let the row be empty."""
-        self.states.leave(self.row)
-
 
 class AssetStates:
     """A row for each of so many assets, whose monitors have states of `size` numbers; it may be empty."""
@@ -207,13 +194,13 @@ class StateHolder:
     def state(self) -> AssetState | None:
         """All that decides what its next block leads to, as it is now; None before it has begun."""
         row, state = self._row, self._state
-        return state if row is None or state is None else row.read(state)
+        return state if row is None or state is None else row.states.read(row.row, state)
 
     @state.setter
     def state(self, state: AssetState | None) -> None:
         self._state = state
         if self._row is not None:
-            self._row.leave()
+            self._row.states.leave(self._row.row)
             self._row = None
 
     @property
@@ -260,9 +247,6 @@ class StateHolder:
         if last > state.position.rows:
             self.state = evolve(state, position=evolve(state.position, rows=last))
 
-    def _move_to(self, row: StateRow) -> None:
-        self._row = row
-
     @property
     def heard(self) -> bool:
         """Whether a block of it was ever counted."""
@@ -272,7 +256,7 @@ class StateHolder:
     def t(self) -> float:
         """Time of the last sample that was counted, or since when it waits for the first [UTC s]; NaN: it does not."""
         row, state = self._row, self._state
-        return row.t if row is not None else math.nan if state is None else state.position.t
+        return float(row.states.t[row.row]) if row is not None else math.nan if state is None else state.position.t
 
 
 def _number(value: float | None) -> float:

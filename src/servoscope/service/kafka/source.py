@@ -19,9 +19,8 @@ from servoscope.service.log import log
 from servoscope.service.mapping.rows import MessageMapping
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.network import TlsSettings
-from servoscope.service.sources.block import ResumePosition
 from servoscope.service.sources.inbox import Inbox
-from servoscope.service.sources.message import InboxMessage, RejectionCounter, SourceAsset, Transport
+from servoscope.service.sources.message import InboxMessage, RejectionCounter, SourceAsset, ThreadTransport
 from servoscope.service.sources.settings import SourceSettings
 
 FETCH_S = 0.2  # how long one call of the client waits for messages
@@ -108,7 +107,7 @@ class _PartitionOffsets:
         return next(iter(self.open), self.next)
 
 
-class KafkaTransport(Transport):
+class KafkaTransport(ThreadTransport):
     """Receives the messages of some topics; `client` names our group, unless the settings do."""
 
     def __init__(self, settings: KafkaSourceSettings, folder: Path, client: str) -> None:
@@ -130,16 +129,10 @@ class KafkaTransport(Transport):
         self._client_settings = settings.client_settings(client, folder)
         self._lock = threading.Lock()
         self._offsets: dict[tuple[str, int], _PartitionOffsets] = {}
-        self._stop_event = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="kafka", daemon=True)
         self.trouble, self.connected = render(message("service.trouble.connecting")), False
 
-    def open(self, resume: Mapping[str, ResumePosition]) -> None:
-        """Connect, now or as soon as a broker is there."""
-        self._thread.start()
-
     def _run(self) -> None:
-        """Follow the topics, in a thread of its own: the client's calls all come from it."""
+        """Follow the topics: the client's calls all come from this thread."""
         consumer = self._kafka.Consumer({**self._client_settings, "error_cb": self._note_error})
         consumer.subscribe(self._topics, on_assign=self._begin_partitions, on_revoke=self._end_partitions)
         committed: dict[tuple[str, int], int] = {}
@@ -208,9 +201,3 @@ class KafkaTransport(Transport):
                 self._note_error(error.args[0])
             else:
                 committed.update(changed)
-
-    def close(self) -> None:
-        """Disconnect."""
-        self._stop_event.set()
-        if self._thread.is_alive():
-            self._thread.join(10.0)

@@ -1,4 +1,4 @@
-"""Regular messages to blocks, many in one call: the plain forms, as `encode_json` and `encode_binary` write them.
+"""Regular messages of JSON to blocks, many in one call: the plain form, as `encode_json` writes it.
 
 A message is regular if it has no further columns, each key once, and numbers and nulls in its lists. What is not, or
 says anything strange, is left to `payload.decode_block`, which knows all forms and what to say of the others.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import accumulate
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,10 +18,11 @@ from servoscope.service.mqtt.number_kernels import (
     CLOSING_BYTES,
     Text,
     Word,
+    as_float,
+    load_word,
     read_number,
     read_whole,
 )
-from servoscope.service.mqtt.words import as_float, load_word
 from servoscope.service.sources.block import MAX_COUNT, MAX_TIME_S
 
 NAMES = b"version", b"stream", b"sequence", b"oldest", b"t0", b"dt", b"t", b"r", b"u", b"y"
@@ -29,18 +30,14 @@ KEYS = np.array([int.from_bytes(name, "little") for name in NAMES], dtype=np.uin
 VERSION, STREAM, SEQUENCE, OLDEST, T0, DT, T = range(7)
 NEEDED = 1 << VERSION | 1 << SEQUENCE | 0b1110 << T
 UNIFORM, STAMPED = 1 << T0 | 1 << DT, 1 << T  # which of the keys tell the times
-SAMPLES, CHECKSUM = VERSION, T0  # in the row of a message's whole numbers; the version is always the same
-ROW_NUMBERS = 5  # numbers of such a row
+SAMPLES = VERSION  # in the row of a message's whole numbers; the version is always the same
+ROW_NUMBERS = 4  # numbers of such a row
 
 COMMA, COLON, QUOTE, OPEN, CLOSE, BEGIN, END = b',:"[]{}'
 SPACE, TAB, NEW_LINE, CARRIAGE_RETURN = b" \t\n\r"
 NULL, MISSING = Word(int.from_bytes(b"null", "little")), Word(0x7FF8 << 48)  # the bits of NaN
 COMMAS, LOW_BITS, ONES = Word(0x2C2C2C2C2C2C2C2C), Word(0x7F7F7F7F7F7F7F7F), Word(0x0101010101010101)
-BINARY_FORM = b"SVSB\x01"  # and its version
-BINARY = Word(int.from_bytes(BINARY_FORM, "little"))
-FORM_BYTES, LOW_BYTES = Word(2**40 - 1), Word(2**32 - 1)
-HEADER_BYTES = 56
-RETAINED_FLAG, TIMES_FLAG, SINGLE_FLAG = 1, 2, 4
+LOW_BYTES = Word(2**32 - 1)
 
 
 class RegularBlock(NamedTuple):
@@ -50,30 +47,23 @@ class RegularBlock(NamedTuple):
     sequence: int
     oldest: int | None
     signals: FloatArray  # t, r, u, y, shape (4, N)
-    checksum: int | None  # that the bytes behind it must have; None: there is none
 
 
 def parse_regular(messages: Sequence[bytes]) -> Iterator[RegularBlock | None]:
     """Yield the block of each message, None where it is not regular; their signals are parts of one array."""
     text = np.frombuffer(b"\0".join((*messages, CLOSING_BYTES)), np.uint8)
     starts = np.array([0, *accumulate(len(one) + 1 for one in messages)])
-    whole, numbers = np.empty((len(messages), ROW_NUMBERS), np.int64), np.empty(_count_numbers(messages, text))
+    # one for each comma, but the last of a list, and t where t0 and dt stand for it: memory is for what is there
+    most = 4 * int(count_commas(text)) // 3
+    whole, numbers = np.empty((len(messages), ROW_NUMBERS), np.int64), np.empty(most)
     parse_messages(text, starts, whole, numbers)
     at = 0
-    for n, stream, sequence, oldest, checksum in whole.tolist():
+    for n, stream, sequence, oldest in whole.tolist():
         if not n:
             yield None
             continue
         signals, at = numbers[at : at + 4 * n].reshape(4, n), at + 4 * n
-        sums = None if checksum < 0 else checksum
-        yield RegularBlock(stream, sequence, None if oldest < 0 else oldest, signals, sums)
-
-
-def _count_numbers(messages: Sequence[bytes], text: Text) -> int:
-    """Return how many numbers there may be in regular blocks, at most: memory is for what is there."""
-    # of JSON one for each comma, but the last of a list, and t where t0 and dt stand for it; of binary32, four bytes
-    binary = sum(len(one) for one in messages if one[:5] == BINARY_FORM)
-    return 4 * int(count_commas(text)) // 3 + binary // 3
+        yield RegularBlock(stream, sequence, None if oldest < 0 else oldest, signals)
 
 
 @kernel
@@ -92,17 +82,14 @@ def parse_messages(text: Text, starts: IntArray, whole: IntArray, numbers: Float
     """Read messages into rows of whole numbers and, one block after the other, t, r, u and y.
 
     `text`: the messages, each with a zero behind it, then `CLOSING_BYTES`; `starts`: of each of them, and of the bytes
-    behind them; `whole`: receives samples, stream, sequence, oldest (-1: none) and checksum (-1: none), shape
-    (messages, 5); no samples: the message is not regular.
+    behind them; `whole`: receives samples, stream, sequence and oldest (-1: none), shape (messages, 4); no samples: the
+    message is not regular.
     """
     at = 0
     for k in range(len(starts) - 1):
         row, begin, stop = whole[k], starts[k], starts[k + 1] - 1
-        row[SAMPLES], row[STREAM], row[OLDEST], row[CHECKSUM] = 0, 0, -1, -1
-        if load_word(text, begin) & FORM_BYTES == BINARY:
-            n = _read_binary(text, begin, stop, row, numbers, at)
-        else:
-            n = _read_json(text, begin, stop, row, numbers, at)
+        row[SAMPLES], row[STREAM], row[OLDEST] = 0, 0, -1
+        n = _read_json(text, begin, stop, row, numbers, at)
         if n > 0 and _are_times(numbers, at, n):
             row[SAMPLES] = n
             at += 4 * n
@@ -123,44 +110,6 @@ def _fill_times(numbers: FloatArray, at: int, n: int, t0: float, dt: float) -> b
     for j in range(n):
         numbers[at + j] = t0 + dt * j
     return 0.0 <= t0 < MAX_TIME_S and 0.0 < dt < MAX_TIME_S
-
-
-@subroutine
-def _read_binary(text: Text, begin: int, stop: int, row: IntArray, numbers: FloatArray, at: int) -> int:
-    """Return the number of samples of a binary message, which are written; 0: it is not regular."""
-    if stop - begin < HEADER_BYTES:
-        return 0
-    flags, more = np.int64(text[begin + 5]), text[begin + 6] | text[begin + 7]
-    sizes = load_word(text, begin + 8)
-    n: Any = np.int64(sizes & LOW_BYTES)
-    width, stamps = 4 if flags & SINGLE_FLAG else 8, flags & TIMES_FLAG
-    if flags > 7 or more or stop - begin != HEADER_BYTES + n * (3 * width + (8 if stamps else 0)):
-        return 0
-    if at + 4 * n > len(numbers) or n == 0:
-        return 0
-    row[CHECKSUM] = np.int64(sizes >> Word(32))
-    for column in range(3):
-        value = load_word(text, begin + 16 + 8 * column)
-        if value > Word(MAX_COUNT):
-            return 0
-        if STREAM + column < OLDEST or flags & RETAINED_FLAG:
-            row[STREAM + column] = np.int64(value)
-    i = begin + HEADER_BYTES
-    if stamps:
-        for j in range(n):
-            numbers[at + j] = as_float(load_word(text, i + 8 * j))
-        i += 8 * n
-    else:
-        t0, dt = as_float(load_word(text, begin + 40)), as_float(load_word(text, begin + 48))
-        if not _fill_times(numbers, at, n, t0, dt):
-            return 0
-    if width == 8:
-        for j in range(3 * n):
-            numbers[at + n + j] = as_float(load_word(text, i + 8 * j))
-    else:
-        for j in range(3 * n):
-            numbers[at + n + j] = as_float(np.uint32(load_word(text, i + 4 * j) & LOW_BYTES))
-    return int(n)
 
 
 @subroutine

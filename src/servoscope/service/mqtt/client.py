@@ -19,9 +19,7 @@ from servoscope.service.log import log
 from servoscope.service.network import TlsSettings
 
 if TYPE_CHECKING:
-    from paho.mqtt.client import Client
-
-    from servoscope.service.mqtt.paho_clients import BulkClient, ReceivedMessage
+    from servoscope.service.mqtt.paho_clients import ReceivedMessage
 
 
 PLAIN_PORT, TLS_PORT = 1883, 8883
@@ -65,44 +63,56 @@ class SessionSettings(BrokerSettings):
 
 
 class BrokerConnection:
-    """How the connection of one client to its broker is, as the client's callbacks tell it."""
+    """A client and its connection to a broker, which it makes anew when it is lost; `client_id` names its session."""
 
-    def __init__(self, settings: SessionSettings, client_id: str) -> None:
-        self._settings, self._client_id = settings, client_id
+    def __init__(self, broker: BrokerSettings, client: Any, client_id: str = "") -> None:
+        self._broker, self._client, self._client_id = broker, client, client_id
         self._lost_at, self._reason = deque[float](maxlen=REPEATED_LOSSES), ""
-        self.connected = False
+        self.connected = False  # whether the broker has accepted us
+        client.on_connect = lambda _client, _data, _flags, reason, _properties: self._take_answer(reason)
+        client.on_connect_fail = lambda *_: self._take_failure()
+        client.on_disconnect = lambda _client, _data, _flags, reason, _properties: self._take_end(reason)
 
-    def handle_connect(self, reason: Any) -> bool:
-        """Take the broker's answer; return whether it has accepted us."""
+    def connect(self, **options: Any) -> None:
+        """Connect, now or as soon as the broker is there."""
+        self._client.connect_async(*self._broker.address, keepalive=KEEPALIVE_S, **options)
+        self._client.loop_start()
+
+    def close(self) -> None:
+        """Disconnect; the broker keeps the session, and what comes for it meanwhile."""
+        self.connected = False  # on purpose: its end is no loss
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def _on_change(self, accepted: bool) -> None:
+        """Do what follows from an answer of the broker, or from the end of a connection; in the client's thread."""
+
+    def _take_answer(self, reason: Any) -> None:
         self.connected = not reason.is_failure
         if self.connected:
             self._reason = ""
-            log("info", "broker connected", broker=self._settings.host)
+            log("info", "broker connected", broker=self._broker.host)
         else:
             self._report(render(message("service.trouble.refused", reason=str(reason))))
-        return self.connected
+        self._on_change(self.connected)
 
-    def handle_failure(self) -> None:
+    def _take_failure(self) -> None:
         """Take an attempt that got no answer, whose exception is being handled."""
         self._report(render(message("service.trouble.unreachable", reason=str(sys.exc_info()[1] or "no answer"))))
 
-    def handle_disconnect(self, reason: Any) -> None:
-        """Take the end of a connection."""
+    def _take_end(self, reason: Any) -> None:
         if self.connected:
             # not every broker says that another client has our name: it shows by our coming back, and being lost again
             taken = reason.value == SESSION_TAKEN_OVER
             self._lost_at.extend([time.monotonic()] * (REPEATED_LOSSES if taken else 1))
-            log("warning", "broker lost", broker=self._settings.host, why=str(reason))
+            log("warning", "broker lost", broker=self._broker.host, why=str(reason))
             self._reason = render(message("service.trouble.lost", reason=str(reason)))
         self.connected = False
-
-    def leave(self) -> None:
-        """Take that the connection is ended on purpose: its end is no loss."""
-        self.connected = False
+        self._on_change(False)
 
     def _report(self, trouble: str) -> None:
         if trouble != self._reason:  # the client retries every few seconds; once in the log is enough
-            log("error", "broker cannot be reached", broker=self._settings.host, why=trouble)
+            log("error", "broker cannot be reached", broker=self._broker.host, why=trouble)
         self._reason = trouble
 
     @property
@@ -115,35 +125,24 @@ class BrokerConnection:
         return self._reason or render(message("service.trouble.connecting"))
 
 
-def create_mqtt_client(settings: BrokerSettings, folder: Path, client_id: str) -> Client:
+def create_mqtt_client(
+    settings: BrokerSettings,
+    folder: Path,
+    client_id: str,
+    on_received: Callable[[ReceivedMessage], None] | None = None,
+) -> Any:
     """Return a client of MQTT 5, not yet connected; paths are relative to `folder`.
 
-    An empty `client_id` lets the broker choose one. Raises ConfigError if a file cannot be used, or paho-mqtt is
-    missing.
+    With `on_received` it is one for many messages, which are acknowledged when we say so. An empty `client_id` lets the
+    broker choose one. Raises ConfigError if a file cannot be used, or paho-mqtt is missing.
     """
-    client: Client = _paho_clients().CheckedClient(settings.checked_address, client_id)
-    _set_up(client, settings, folder)
-    return client
-
-
-def create_bulk_client(
-    settings: BrokerSettings, folder: Path, client_id: str, on_received: Callable[[ReceivedMessage], None]
-) -> BulkClient:
-    """Return a client as `create_mqtt_client` does, for many messages, which are acknowledged when we say so."""
-    client: BulkClient = _paho_clients().BulkClient(settings.checked_address, client_id, on_received)
-    _set_up(client, settings, folder)
-    return client
-
-
-def _paho_clients() -> Any:
     try:
-        from servoscope.service.mqtt import paho_clients
+        from servoscope.service.mqtt.paho_clients import BulkClient, CheckedClient
     except ModuleNotFoundError:
         raise ConfigError("paho-mqtt is missing, pip install 'servoscope[mqtt]'") from None
-    return paho_clients
-
-
-def _set_up(client: Client, settings: BrokerSettings, folder: Path) -> None:
+    client = CheckedClient(settings.checked_address, client_id)
+    if on_received is not None:
+        client = BulkClient(settings.checked_address, client_id, on_received)
     client.reconnect_delay_set(1, MAX_RECONNECT_DELAY_S)
     client.max_inflight_messages_set(1000)  # the broker's own limit, which it states on connecting, may be lower
     if settings.user is not None:
@@ -152,3 +151,4 @@ def _set_up(client: Client, settings: BrokerSettings, folder: Path) -> None:
         client.tls_set_context(settings.create_tls_context(folder, settings.host))
     elif settings.has_certificates:
         raise ConfigError(f"{settings.host}: certificates are given, but not tls = true")
+    return client

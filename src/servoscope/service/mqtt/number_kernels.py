@@ -10,13 +10,16 @@ of such a number is -1. `CLOSING_BYTES` have to follow a text.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
 from servoscope.core.jit import inline
-from servoscope.service.mqtt.words import leading_zeros, load_word, multiply_high, trailing_zeros
 
 Word = np.uint64
 Text = npt.NDArray[np.uint8]
@@ -36,6 +39,48 @@ TENS = np.array([10**k for k in range(MAX_DIGITS + 1)], dtype=np.uint64)
 SIGN, TOP, ROUNDING = Word(1 << 63), Word(63), Word(9)
 FRACTION, HIDDEN_BIT, CARRY, EXPONENT_PLACE = Word(2**52 - 1), Word(2**52), Word(2**53), Word(52)
 LOW_BITS, LAST_BITS = Word(2**9 - 1), Word(3)
+
+
+@inline
+def load_word(data: Any, i: int) -> Any:
+    """Return bytes i to i + 7 of an array of bytes as a word, the first of them lowest."""
+    word = np.uint64(0)
+    for k in range(BYTES):
+        word |= np.uint64(data[i + k]) << np.uint64(8 * k)
+    return word
+
+
+@intrinsic
+def as_float(typing: Any, word: Any) -> Any:
+    """Return the binary64 whose bits a word is."""
+    return types.float64(word), lambda context, builder, signature, values: builder.bitcast(
+        values[0], context.get_value_type(types.float64)
+    )
+
+
+@intrinsic
+def multiply_high(typing: Any, a: Any, b: Any) -> Any:
+    """Return the upper 64 bits of the product of two words."""
+
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        wide = ir.IntType(128)
+        product = builder.mul(*(builder.zext(value, wide) for value in values))
+        return builder.trunc(builder.lshr(product, wide(64)), ir.IntType(64))
+
+    return types.uint64(types.uint64, types.uint64), code
+
+
+def _count_zeros(instruction: str) -> Callable[..., Any]:
+    def count(typing: Any, word: Any) -> Any:
+        return types.uint64(types.uint64), lambda context, builder, signature, values: getattr(builder, instruction)(
+            values[0], ir.IntType(1)(0)
+        )
+
+    made: Callable[..., Any] = intrinsic(count)
+    return made
+
+
+leading_zeros, trailing_zeros = _count_zeros("ctlz"), _count_zeros("cttz")  # of a word; 64: all its bits
 
 
 def _powers_of_ten() -> WordArray:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from servoscope.core.settings import NonNegative
 from servoscope.service.mqtt import topics
-from servoscope.service.mqtt.client import KEEPALIVE_S, BrokerConnection, SessionSettings, create_mqtt_client
+from servoscope.service.mqtt.client import BrokerConnection, SessionSettings, create_mqtt_client
 from servoscope.service.publishers.base import PublisherSettings, StatusByAsset
 
 IMMEDIATE_KEYS = ("verdict", "ne107", "alarms", "faults", "quality", "service")  # changes of these are sent at once
@@ -29,15 +29,13 @@ class MqttPublisherSettings(SessionSettings, PublisherSettings):
         return MqttPublisher(self, folder, name)
 
 
-class MqttPublisher:
+class MqttPublisher(BrokerConnection):
     """Publishes the newest status of each asset; `client` names its session, unless the settings do."""
 
     def __init__(self, settings: MqttPublisherSettings, folder: Path, client: str) -> None:
+        client = settings.client or client
+        super().__init__(settings, create_mqtt_client(settings, folder, client), client)
         self.settings = settings
-        self._client = create_mqtt_client(settings, folder, settings.client or client)
-        self._broker = BrokerConnection(settings, settings.client or client)
-        self._client.on_connect, self._client.on_disconnect = self._on_connect, self._on_disconnect
-        self._client.on_connect_fail = lambda *_: self._broker.handle_failure()
         self._lock = threading.Lock()
         self._newest: dict[str, bytes] = {}
         self._published: dict[str, tuple[Any, float]] = {}
@@ -45,8 +43,7 @@ class MqttPublisher:
     def open(self, statuses: StatusByAsset) -> None:
         """Connect, now or as soon as the broker is there."""
         self.publish(statuses)
-        self._client.connect_async(*self.settings.address, keepalive=KEEPALIVE_S)
-        self._client.loop_start()
+        self.connect()
 
     def publish(self, statuses: StatusByAsset) -> None:
         """Publish what has changed."""
@@ -60,29 +57,13 @@ class MqttPublisher:
             message = json.dumps({"asset": name, **status}, separators=(",", ":")).encode()
             with self._lock:
                 self._newest[name] = message
-                if self._broker.connected:
+                if self.connected:
                     self._send(name)
 
     def _send(self, name: str) -> None:
         self._client.publish(topics.status_topic(self.settings.topic, name), self._newest[name], qos=1, retain=True)
 
-    def _on_connect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+    def _on_change(self, accepted: bool) -> None:
         with self._lock:
-            accepted = self._broker.handle_connect(reason)
             for name in self._newest if accepted else ():  # the broker may have lost them, or never had them
                 self._send(name)
-
-    def _on_disconnect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
-        with self._lock:
-            self._broker.handle_disconnect(reason)
-
-    @property
-    def trouble(self) -> str:
-        """What is wrong with the connection, in words; empty: nothing."""
-        return self._broker.trouble
-
-    def close(self) -> None:
-        """Disconnect."""
-        self._broker.leave()
-        self._client.disconnect()
-        self._client.loop_stop()

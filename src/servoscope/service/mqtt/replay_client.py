@@ -18,7 +18,7 @@ from servoscope.models.loop import Loop
 from servoscope.service.config_types import FileSettings, Seconds
 from servoscope.service.log import log
 from servoscope.service.mqtt import payload, topics
-from servoscope.service.mqtt.client import KEEPALIVE_S, BrokerSettings, create_mqtt_client
+from servoscope.service.mqtt.client import BrokerConnection, BrokerSettings, create_mqtt_client
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.replay import ReplaySettings, ReplayTransport
 
@@ -78,7 +78,7 @@ class _SendQueue:
     probe: int | None = None
 
 
-class ReplayClient:
+class ReplayClient(BrokerConnection):
     """Sends recordings, and ends when all blocks are acknowledged."""
 
     def __init__(self, settings: ReplayClientSettings) -> None:
@@ -89,14 +89,13 @@ class ReplayClient:
             name: (tuple(settings.folder / file for file in one.files), Loop.load(settings.folder / one.loop))
             for name, one in settings.assets.items()
         }
-        covariates = {name: tuple(loop.columns.covariates) for name, (_, loop) in files.items()}
-        self._replay = ReplayTransport(settings.replay.model_copy(update={"start": start}), files, covariates)
-        self._client = create_mqtt_client(settings.broker, settings.folder, "")
-        self._client.on_connect, self._client.on_disconnect = self._on_connect, self._on_disconnect
+        self._covariates = {name: tuple(loop.columns.covariates) for name, (_, loop) in files.items()}
+        self._replay = ReplayTransport(settings.replay.model_copy(update={"start": start}), files, self._covariates)
+        super().__init__(settings.broker, create_mqtt_client(settings.broker, settings.folder, ""))
         self._client.on_message = self._on_message
         self._acks: SimpleQueue[tuple[str, int, int]] = SimpleQueue()
         self._queues = {name: _SendQueue(settings.again_s) for name in settings.assets}
-        self._connected = self._reconnected = self._stopping = False
+        self._reconnected = self._stopping = False
         self.acknowledged = self.repeated = 0  # blocks that were acknowledged, and messages that were sent once more
 
     def stop(self) -> None:
@@ -109,16 +108,14 @@ class ReplayClient:
         Raises SourceError if it was stopped before all was acknowledged, or the service has counted a later stream of
         an asset.
         """
-        self._client.connect_async(*self.settings.broker.address, keepalive=KEEPALIVE_S)
-        self._client.loop_start()
+        self.connect()
         try:
             self._begin()
             while not self._stopping and not self._done:
                 self._run_once()
                 time.sleep(POLL_S)
         finally:
-            self._client.disconnect()
-            self._client.loop_stop()
+            self.close()
         if left := sum(len(queue.blocks) for queue in self._queues.values()):
             raise SourceError(
                 f"stopped while {left} blocks were not known to be safe; the same start goes on with them"
@@ -131,7 +128,7 @@ class ReplayClient:
 
     def _begin(self) -> None:
         """Continue behind what the service has."""
-        while not self._connected and not self._stopping:
+        while not self.connected and not self._stopping:
             time.sleep(POLL_S)
         time.sleep(RETAINED_WAIT_S)
         known = {
@@ -160,7 +157,7 @@ class ReplayClient:
         now = time.monotonic()
         for asset, sequence in self._take_acknowledged().items():
             self._release(self._queues[asset], sequence, now)
-        if not self._connected:
+        if not self.connected:
             return
         free = self.settings.ahead * len(self._queues) - sum(len(queue.blocks) for queue in self._queues.values())
         for message in self._replay.receive(free):
@@ -197,7 +194,7 @@ class ReplayClient:
         if self.settings.format == "binary":
             message = payload.encode_binary(block, oldest)
         else:
-            message = payload.encode_json(block, oldest, self._replay.covariates(block.asset))
+            message = payload.encode_json(block, oldest, self._covariates[block.asset])
         blocks.append(_UnacknowledgedBlock(block.sequence, message))
 
     def _send(self, asset: str, one: _UnacknowledgedBlock) -> None:
@@ -211,18 +208,13 @@ class ReplayClient:
             one.first_sent_at = time.monotonic() if one.publish_info is None else None
             one.publish_info = self._client.publish(topics.data_topic(self.settings.topic, asset), one.message, qos=1)
 
-    def _on_connect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+    def _on_change(self, accepted: bool) -> None:
         from paho.mqtt.subscribeoptions import SubscribeOptions
 
-        if reason.is_failure:
-            log("error", "broker refuses", broker=self.settings.broker.host, why=str(reason))
-            return
-        acks = [topics.ack_topic(self.settings.topic, name) for name in self._queues]
-        self._client.subscribe([(topic, SubscribeOptions(qos=1)) for topic in acks])
-        self._connected = self._reconnected = True
-
-    def _on_disconnect(self, *_: Any) -> None:
-        self._connected = False
+        if accepted:
+            acks = [topics.ack_topic(self.settings.topic, name) for name in self._queues]
+            self._client.subscribe([(topic, SubscribeOptions(qos=1)) for topic in acks])
+            self._reconnected = True
 
     def _on_message(self, _client: Any, _data: Any, message: MQTTMessage) -> None:
         try:

@@ -15,7 +15,7 @@ from servoscope.service.config_types import Seconds
 from servoscope.service.mapping.rows import MessageMapping
 from servoscope.service.mapping.settings import PayloadSettings
 from servoscope.service.mqtt import topics
-from servoscope.service.mqtt.client import KEEPALIVE_S, BrokerConnection, SessionSettings, create_bulk_client
+from servoscope.service.mqtt.client import BrokerConnection, SessionSettings, create_mqtt_client
 from servoscope.service.mqtt.payload import BlockMessages
 from servoscope.service.sources.block import ResumePosition
 from servoscope.service.sources.inbox import Inbox
@@ -73,16 +73,16 @@ class _Delivery:
         self.acknowledge(self)
 
 
-class MqttTransport(Transport):
+class MqttTransport(BrokerConnection, Transport):  # type: ignore[override]  # what is wrong is asked for, not kept
     """Receives messages from a broker, which keeps those that are not released; `client` names our session."""
 
     def __init__(self, settings: MqttSourceSettings, folder: Path, client: str) -> None:
-        super().__init__()
+        Transport.__init__(self)
         client = settings.client or client
-        self.settings, self._client = settings, create_bulk_client(settings, folder, client, self._on_message)
-        self._broker = BrokerConnection(settings, client)
-        self._client.on_connect, self._client.on_disconnect = self._on_connect, self._on_disconnect
-        self._client.on_connect_fail = lambda *_: self._broker.handle_failure()
+        BrokerConnection.__init__(
+            self, settings, create_mqtt_client(settings, folder, client, self._on_message), client
+        )
+        self.settings = settings
         self._lock = threading.Lock()  # held while a message is acknowledged: never one of another connection
         self._connection = 0
         self._waiting_again: dict[tuple[str, bytes], _Delivery] = {}  # those of earlier connections
@@ -96,16 +96,15 @@ class MqttTransport(Transport):
         session.SessionExpiryInterval = int(self.settings.session_s)
         session.ReceiveMaximum = self.settings.in_flight
         session.MaximumPacketSize = OVERSIZE_FACTOR * self.settings.largest
-        self._client.connect_async(*self.settings.address, keepalive=KEEPALIVE_S, clean_start=False, properties=session)
-        self._client.loop_start()
+        self.connect(clean_start=False, properties=session)
 
-    def _on_connect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+    def _on_change(self, accepted: bool) -> None:
         with self._lock:
             self._connection += 1
             self._waiting_again = {
                 (one.address, one.content): one.release for one in self.waiting if isinstance(one.release, _Delivery)
             }
-        if not self._broker.handle_connect(reason):
+        if not accepted:
             return
         # also where the broker has the session: that of a killed process may have an old subscription
         self.leave(topics.data_topic(self.settings.topic, "+"))
@@ -113,25 +112,10 @@ class MqttTransport(Transport):
         for k in range(0, len(wanted), TOPICS_AT_ONCE):
             self._client.subscribe([(topic, 1) for topic in wanted[k : k + TOPICS_AT_ONCE]])
 
-    def _on_disconnect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
-        with self._lock:
-            self._connection += 1
-        self._broker.handle_disconnect(reason)
-
     @property
     def layer_seconds(self) -> Mapping[str, float]:  # type: ignore[override]
         """Processor time of the client's thread, as it was at the last message [s]."""
         return {"receive": self._client.thread_s}
-
-    @property
-    def connected(self) -> bool:  # type: ignore[override]
-        """Whether the broker has accepted us."""
-        return self._broker.connected
-
-    @property
-    def trouble(self) -> str:  # type: ignore[override]
-        """What is wrong with the connection, in words; empty: nothing."""
-        return self._broker.trouble
 
     def _on_message(self, message: ReceivedMessage) -> None:
         """Keep a message that is neither too large to wait in memory nor one too many; in the client's thread."""
@@ -180,9 +164,3 @@ class MqttTransport(Transport):
         """Unsubscribe: an earlier service file had it, and the broker has kept that."""
         if 0 < len(address) < 1000:  # empty: an alias, which we have not allowed; too long: made up
             self._client.unsubscribe(address)
-
-    def close(self) -> None:
-        """Disconnect; the broker keeps what comes meanwhile."""
-        self._broker.leave()
-        self._client.disconnect()
-        self._client.loop_stop()

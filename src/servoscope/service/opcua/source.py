@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import math
 import re
-import threading
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -19,17 +18,10 @@ from servoscope.core.addresses import show_address
 from servoscope.core.errors import ConfigError
 from servoscope.core.messages import message, render
 from servoscope.core.settings import NonEmptyStr
-from servoscope.service.assets.reception import AssetTrouble
+from servoscope.service.assets.reception import Reception
 from servoscope.service.config_types import Seconds, read_password
 from servoscope.service.log import log
 from servoscope.service.network import ConnectionSettings
-from servoscope.service.opcua.monitored_items import (
-    ItemGrant,
-    ItemRequest,
-    monitor_nodes,
-    publishing_interval,
-    shorten_interval,
-)
 from servoscope.service.opcua.settings import (
     CertificateSettings,
     OpcuaNodes,
@@ -38,10 +30,19 @@ from servoscope.service.opcua.settings import (
     describe_expiry,
     import_asyncua,
 )
-from servoscope.service.opcua.subscriptions import QUEUE_MARGIN, ArraySubscription, ScalarSubscription, timestamp
+from servoscope.service.opcua.subscriptions import (
+    QUEUE_MARGIN,
+    ArraySubscription,
+    ItemTerms,
+    ScalarSubscription,
+    monitor_nodes,
+    publishing_interval,
+    shorten_interval,
+    timestamp,
+)
 from servoscope.service.sources.block import Block, ResumePosition
 from servoscope.service.sources.inbox import Inbox
-from servoscope.service.sources.message import BlockDecoder, InboxMessage, SourceAsset, Transport
+from servoscope.service.sources.message import BlockDecoder, InboxMessage, SourceAsset, ThreadTransport
 from servoscope.service.sources.settings import SourceSettings
 
 SETTLING_S = 2.0  # behind the server's clock: a change that has not been reported by then has not happened
@@ -122,7 +123,7 @@ class _SubscriptionHandler:
         self.end_status = str(status.Status)
 
 
-class OpcuaTransport(Transport):
+class OpcuaTransport(ThreadTransport):
     """Subscribes to the nodes of several assets, and makes blocks of their values.
 
     A server waits for no acknowledgement: what was not stored is read from its history after a restart.
@@ -139,14 +140,13 @@ class OpcuaTransport(Transport):
         self._assets = dict(assets)
         check_nodes(settings.heartbeat, *(node for one in self._assets.values() for node in one.address.given))
         self._handles = 1  # of the next item that is monitored
-        self._stop_event = threading.Event()
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), name="opcua", daemon=True)
+        self.ends_within_s = 2.0 * settings.heartbeat_s
         self._subscriptions: list[ArraySubscription | ScalarSubscription] = []
         self._last_heartbeat = self._server_time = math.nan
         self.trouble, self.connected = render(message("service.trouble.connecting")), False
 
     @property
-    def asset_troubles(self) -> dict[str, AssetTrouble]:  # type: ignore[override]
+    def asset_troubles(self) -> dict[str, Reception]:  # type: ignore[override]
         """Assets whose nodes are refused, or come too slowly."""
         return {one.asset: one.trouble for one in self._subscriptions if one.trouble is not None}
 
@@ -166,13 +166,16 @@ class OpcuaTransport(Transport):
                 signals = [*nodes.signals, *(nodes.covariates[one] for one in wanted)]
                 size = max(1, round(self.settings.block * rate))
                 self._subscriptions.append(ScalarSubscription(name, signals, at, *common, rate, size, wanted))
-        self._thread.start()
+        super().open(resume)
 
     def _enqueue(self, block: Block) -> None:
         self.waiting.append(InboxMessage(block.asset, block, block.completed_at))
 
-    async def _run(self) -> None:
-        """Follow the server through its restarts, in a thread of its own."""
+    def _run(self) -> None:
+        asyncio.run(self._follow())
+
+    async def _follow(self) -> None:
+        """Follow the server through its restarts."""
         while not self._stop_event.is_set():
             try:
                 async with await create_opcua_client(self.settings, self._password, self._folder) as client:
@@ -202,7 +205,7 @@ class OpcuaTransport(Transport):
         values: deque[tuple[Any, Any]] = deque()
         handler, period = _SubscriptionHandler(values), self.settings.publishing_s
         subscription = await client.create_subscription(1000.0 * period, handler)
-        grants = dict[str, ItemGrant]()
+        grants = dict[str, ItemTerms]()
         period = await self._subscribe(subscription, grants)
         heartbeat = ua.NodeId.from_string(self.settings.heartbeat)
         now = _parse_heartbeat(await client.get_node(heartbeat).read_data_value())
@@ -231,18 +234,18 @@ class OpcuaTransport(Transport):
                 retry_at = time.monotonic() + RETRY_NODES_S
                 period = await self._subscribe(subscription, grants)
 
-    async def _subscribe(self, subscription: Any, grants: dict[str, ItemGrant]) -> float:
+    async def _subscribe(self, subscription: Any, grants: dict[str, ItemTerms]) -> float:
         """Subscribe to the heartbeat and to all nodes that are not yet granted; return the publishing interval [s].
 
         A server may grant less than it was asked for: where its queues are shorter, messages have to come sooner.
         """
         period, heartbeat = publishing_interval(subscription), self.settings.heartbeat
         wanted = {
-            node: ItemRequest(one.sampling_ms, one.queue_size(period))
+            node: ItemTerms(one.sampling_ms, one.queue_size(period))
             for one in self._subscriptions
             for node in one.nodes
         }
-        wanted[heartbeat] = ItemRequest(1000.0 * period, 1)
+        wanted[heartbeat] = ItemTerms(1000.0 * period, 1)
         missing = {node: one for node, one in wanted.items() if node not in grants or grants[node].refusal}
         changed = [one for one in self._subscriptions if not missing.keys().isdisjoint(one.nodes)]
         grants |= await monitor_nodes(subscription, missing, self._handles)
@@ -255,12 +258,6 @@ class OpcuaTransport(Transport):
         for one in changed:
             one.check_grants(grants, period)
         return period
-
-    def close(self) -> None:
-        """Disconnect."""
-        self._stop_event.set()
-        if self._thread.is_alive():
-            self._thread.join(2.0 * self.settings.heartbeat_s)
 
 
 def _parse_heartbeat(value: Any) -> float:

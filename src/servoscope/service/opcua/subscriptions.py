@@ -7,19 +7,17 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from servoscope.core.errors import MessageError
 from servoscope.core.messages import message, render
-from servoscope.service.assets.reception import AssetTrouble
-from servoscope.service.opcua.monitored_items import ItemGrant
-from servoscope.service.sources.assembly import SIGNALS, BlockAssembler
+from servoscope.service.assets.reception import Reception
+from servoscope.service.sources.assembly import MAX_PERIODS, SIGNALS, BlockAssembler
 from servoscope.service.sources.block import MAX_TIME_S, Block, ResumePosition
 from servoscope.service.sources.message import RejectionCounter
 from servoscope.service.sources.resample import CLOCK_STEP_S
-from servoscope.service.sources.update_rate import MAX_PERIODS
 
 CLOCK_MARGIN_S = 10.0  # a server's clock may stand still for a second or more
 OVERFLOW_BITS = 0x480  # info type "data value" and its bit "overflow": the server's queue was too short
@@ -32,6 +30,84 @@ TRANSIENT_STATUSES = {  # status codes, the library's among them, of trouble tha
 }  # fmt: skip
 MAX_HELD_S = 60.0  # of samples that wait for the decision whether they come too slowly
 MAX_EXACT_INT = 2.0**53  # beyond, a binary64 cannot count
+
+
+class ItemTerms(NamedTuple):
+    """How a node is watched: the interval at which it is sampled [ms], and how many values the server keeps.
+
+    As it is asked for, or as the server has revised it; `refusal`: why it grants nothing, else empty.
+    """
+
+    sampling_ms: float
+    queue: int
+    refusal: str = ""
+
+
+class _AnswerRecorder:
+    """Stands before a session while items are created: the library returns their numbers, and drops the rest."""
+
+    def __init__(self, session: Any) -> None:
+        self._session, self.answers = session, list[Any]()
+
+    def __getattr__(self, name: str) -> Any:
+        # the first values may come before the last item is created; they are the session's
+        return getattr(self._session, name)
+
+    async def create_monitored_items(self, parameters: Any) -> Any:
+        """Create them, and keep the answers."""
+        self.answers = await self._session.create_monitored_items(parameters)
+        return self.answers
+
+
+async def monitor_nodes(subscription: Any, wanted: Mapping[str, ItemTerms], first: int) -> dict[str, ItemTerms]:
+    """Subscribe to nodes; return what the server grants of each. `first`: number of the first, unique in it."""
+    from asyncua import ua
+    from asyncua.ua.attribute_ids import AttributeIds
+
+    stamped = ua.DataChangeFilter(Trigger=ua.DataChangeTrigger.StatusValueTimestamp)
+    items = [
+        ua.MonitoredItemCreateRequest(
+            ua.ReadValueId(NodeId=ua.NodeId.from_string(node), AttributeId=AttributeIds.Value),
+            ua.MonitoringMode.Reporting,
+            ua.MonitoringParameters(ClientHandle=k, SamplingInterval=sampling, QueueSize=queue, Filter=stamped),
+        )
+        for k, (node, (sampling, queue, _)) in enumerate(wanted.items(), first)
+    ]
+    session = subscription.server
+    subscription.server = recorder = _AnswerRecorder(session)
+    try:
+        await subscription.create_monitored_items(items)
+    finally:
+        subscription.server = session
+    return {
+        node: ItemTerms(one.RevisedSamplingInterval, one.RevisedQueueSize)
+        if one.StatusCode.is_good()
+        else ItemTerms(0.0, 0, one.StatusCode.name)
+        for node, one in zip(wanted, recorder.answers, strict=True)
+    }
+
+
+def publishing_interval(subscription: Any) -> float:
+    """Return the time between two messages of a subscription, as the server has revised it [s]."""
+    return float(subscription.parameters.RequestedPublishingInterval) / 1000.0
+
+
+async def shorten_interval(subscription: Any, interval_s: float) -> float:
+    """Ask for messages that come so much sooner [s]; return what is granted."""
+    from asyncua import ua
+
+    one = subscription.parameters
+    answer = await subscription.update(
+        ua.ModifySubscriptionParameters(
+            SubscriptionId=subscription.subscription_id,
+            RequestedPublishingInterval=1000.0 * interval_s,
+            RequestedLifetimeCount=one.RequestedLifetimeCount,
+            RequestedMaxKeepAliveCount=one.RequestedMaxKeepAliveCount,
+            MaxNotificationsPerPublish=one.MaxNotificationsPerPublish,
+            Priority=one.Priority,
+        )
+    )
+    return float(answer.RevisedPublishingInterval) / 1000.0
 
 
 class _Subscription(ABC):
@@ -51,19 +127,19 @@ class _Subscription(ABC):
         self.asset, self.nodes, self._covariates = asset, nodes, covariates
         self._sequence, self._last_t = resume.sequence, resume.last_t
         self._emit, self._rejections = emit, rejections
-        self.trouble: AssetTrouble | None = None  # why there are no samples although the server is there
+        self.trouble: Reception | None = None  # why there are no samples although the server is there
 
     def queue_size(self, publishing_s: float) -> int:
         """Return how many values the server keeps between two messages: those of two intervals, and twice that."""
         return max(10, math.ceil(2 * QUEUE_MARGIN * publishing_s / self.value_s))
 
-    def check_grants(self, grants: Mapping[str, ItemGrant], publishing_s: float) -> None:
+    def check_grants(self, grants: Mapping[str, ItemTerms], publishing_s: float) -> None:
         """Take what the server grants of each node, and of the time between two messages [s]."""
         refused = [(node, grants[node].refusal) for node in self.nodes if grants[node].refusal]
         words = [render(message("service.trouble.node", node=node, reason=reason)) for node, reason in refused]
-        self.trouble = AssetTrouble("refused", ", ".join(words)) if words else None
+        self.trouble = Reception("refused", ", ".join(words)) if words else None
 
-    def longest_interval_s(self, grants: Mapping[str, ItemGrant]) -> float:
+    def longest_interval_s(self, grants: Mapping[str, ItemTerms]) -> float:
         """Return how long messages may be apart before values are lost [s]; of blocks nobody knows."""
         return math.inf
 
@@ -128,12 +204,12 @@ class ScalarSubscription(_Subscription):
         self._granted_ms: dict[int, float] = {}  # what the server says of signals that it would sample too slowly
         self._short_queues, self._undecided = "", False
 
-    def longest_interval_s(self, grants: Mapping[str, ItemGrant]) -> float:
+    def longest_interval_s(self, grants: Mapping[str, ItemTerms]) -> float:
         """Return how long messages may be apart before the shortest queue of its nodes runs over [s]."""
         queues = [grants[node].queue for node in self.nodes[: len(SIGNALS)] if not grants[node].refusal]
         return self.value_s * max(1, min(queues, default=0)) if queues else math.inf
 
-    def check_grants(self, grants: Mapping[str, ItemGrant], publishing_s: float) -> None:
+    def check_grants(self, grants: Mapping[str, ItemTerms], publishing_s: float) -> None:
         """Take what the server grants: slower than the samples it has no samples for us."""
         super().check_grants(grants, publishing_s)
         self._assembler.restart_rates()
@@ -165,7 +241,7 @@ class ScalarSubscription(_Subscription):
         slow = self._assembler.slow_ms | self._granted_ms
         words = [self._assembler.describe_slow(k, interval_ms) for k, interval_ms in sorted(slow.items())]
         words += [self._short_queues] if self._short_queues else []
-        self.trouble = AssetTrouble("slow", ", ".join(words)) if words else None
+        self.trouble = Reception("slow", ", ".join(words)) if words else None
         self._undecided = bool(self._granted_ms) and False not in told
 
     async def read_missed(self, client: Any, now: float) -> None:

@@ -8,7 +8,6 @@ import heapq
 import math
 import os
 import queue
-import threading
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
@@ -24,7 +23,7 @@ from servoscope.core.errors import EmptyRecordingError, OutputError
 from servoscope.core.messages import message as text
 from servoscope.core.messages import render
 from servoscope.core.settings import NonEmptyStr
-from servoscope.service.assets.reception import AssetTrouble
+from servoscope.service.assets.reception import Reception
 from servoscope.service.config_types import Seconds
 from servoscope.service.log import log
 from servoscope.service.sources.block import Block, ResumePosition
@@ -48,7 +47,7 @@ from servoscope.service.sources.message import (
     InboxMessage,
     RejectionCounter,
     SourceAsset,
-    Transport,
+    ThreadTransport,
 )
 
 DONE, FAILED = "done", "failed"  # subfolders that files are moved to
@@ -153,7 +152,7 @@ class LogDecoder(Decoder):
             yield Block.from_signals(name, self._sequences[name], signals, time.monotonic())
 
 
-class FolderTransport(Transport):
+class FolderTransport(ThreadTransport):
     """Follows the files of some assets in a folder; a thread looks into it and reads, one file ahead.
 
     What was counted of an asset is known by the time of its last sample alone: a restart reads what may hold later
@@ -177,13 +176,11 @@ class FolderTransport(Transport):
         self._asked_at = math.inf  # since when an answer of the share is waited for, by the monotonic clock [s]
         self._files_wait = True  # whether there are files that are complete, or soon will be
         self._stored = queue.SimpleQueue[ReadFile]()
-        self._stop_event = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="folder", daemon=True)
 
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         """Look into the folder from now on."""
         self._resumed = self.settings.begin_times(self._assets, resume)
-        self._thread.start()
+        super().open(resume)
 
     @property
     def connected(self) -> bool:  # type: ignore[override]
@@ -204,12 +201,6 @@ class FolderTransport(Transport):
     def pause_s(self) -> float:  # type: ignore[override]
         """How long an asset may pause [s]: without bound while files wait, or the folder cannot be reached."""
         return math.inf if self._files_wait or self.trouble else self.settings.interval_s
-
-    def close(self) -> None:
-        """Stop."""
-        self._stop_event.set()
-        if self._thread.is_alive():
-            self._thread.join(10.0)
 
     def preview(self) -> list[str]:
         """Return what it would read, and what it cannot."""
@@ -314,7 +305,7 @@ class FolderTransport(Transport):
         except FileNotFoundError:  # somebody has moved it
             return
         except PermissionError as error:  # it may be open elsewhere: it is tried again
-            refused = AssetTrouble("refused", f"{path}: cannot be read ({error.strerror})")
+            refused = Reception("refused", f"{path}: cannot be read ({error.strerror})")
             if self.asset_troubles.get(assets[0]) != refused:
                 self.rejections.add(file.asset, "unreadable", refused.why)
             self.asset_troubles = {**self.asset_troubles, **dict.fromkeys(assets, refused)}
@@ -342,7 +333,7 @@ class FolderTransport(Transport):
         for why in dict.fromkeys(failures.values()):
             self.rejections.add(file.asset, "unreadable", why)
         kept = {name: one for name, one in self.asset_troubles.items() if name not in assets or not rows}
-        self.asset_troubles = kept | {name: AssetTrouble("refused", why) for name, why in failures.items()}
+        self.asset_troubles = kept | {name: Reception("refused", why) for name, why in failures.items()}
         is_new = file.name not in (self._first_names or ())
         read = ReadFile(file, rows, is_new, FAILED if failures else DONE)
         while self.waiting and not self._stop_event.wait(POLL_S):

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from servoscope.core.errors import MessageError
 from servoscope.core.messages import message as text
 from servoscope.core.messages import render
-from servoscope.service.assets.reception import AssetTrouble
+from servoscope.service.assets.reception import Reception
 from servoscope.service.log import log
 from servoscope.service.sources.assembly import AssetStream, Receipt
 from servoscope.service.sources.block import Block, ResumePosition
@@ -110,7 +110,7 @@ class Inbox:
         return self.transport.trouble
 
     @property
-    def asset_troubles(self) -> Mapping[str, AssetTrouble]:
+    def asset_troubles(self) -> Mapping[str, Reception]:
         """Assets that come too slowly, or whose sender is gone or refuses them."""
         own = {name: one.trouble for name, one in self._streams.items() if one.trouble is not None}
         return {**own, **self.transport.asset_troubles}
@@ -244,7 +244,7 @@ class Inbox:
             stream = self._stream(name)
             self._collect(stream, short=True)
             stream.restart()
-            stream.trouble = AssetTrouble("silent", render(text("service.trouble.death", topic=message.address)))
+            stream.trouble = Reception("silent", render(text("service.trouble.death", topic=message.address)))
         now = time.time()
         for name, values in content.values.items():
             values = self._drop_future(name, values, now + self._assets[name].ahead_s)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from servoscope.core.errors import MessageError
 from servoscope.models.loop import Loop
-from servoscope.service.assets.reception import AssetTrouble
+from servoscope.service.assets.reception import Reception
 from servoscope.service.sources.block import Block, ResumePosition
 
 POLL_S = 0.02  # between two looks at a transport whose messages come from a thread of its own
@@ -151,7 +151,7 @@ class Transport(ABC):
     keeps = True  # whether what was not released comes again, so that messages may wait; else blocks are dropped
     connected = True
     trouble = ""  # why nothing can be received, in words; empty: nothing is wrong
-    asset_troubles: Mapping[str, AssetTrouble] = NOTHING
+    asset_troubles: Mapping[str, Reception] = NOTHING
     update_intervals_s: Mapping[tuple[str, str], float] = NOTHING
     layer_seconds: Mapping[str, float] = NOTHING
     pause_s = 0.0  # how long an asset may pause without being silent [s]
@@ -196,6 +196,31 @@ class Transport(ABC):
     @abstractmethod
     def close(self) -> None:
         """Stop; it may be called twice."""
+
+
+class ThreadTransport(Transport):
+    """Follows its source in a thread of its own, from `open` to `close`."""
+
+    ends_within_s = 10.0  # how long `close` waits for its end [s]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._stop_event = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=type(self).__name__, daemon=True)
+
+    def open(self, resume: Mapping[str, ResumePosition]) -> None:
+        """Begin, now or as soon as there is a connection."""
+        self._thread.start()
+
+    @abstractmethod
+    def _run(self) -> None:
+        """Follow the source until `_stop_event` is set."""
+
+    def close(self) -> None:
+        """Stop."""
+        self._stop_event.set()
+        if self._thread.is_alive():
+            self._thread.join(self.ends_within_s)
 
 
 class BlockDecoder(Decoder):

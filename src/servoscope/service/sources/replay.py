@@ -87,10 +87,9 @@ class ReplayStream:
             return None
         recording, rows, start = found
         t = stream_start + start + (recording.t[rows] - recording.t[0])
-        block = Block(asset, sequence, np.asarray(t), recording.r[rows], recording.u[rows], recording.y[rows])
-        if not self.covariates:
-            return block
-        return replace(block, covariates=np.stack([recording.channels[name][rows] for name in self.covariates]))
+        carried = [recording.channels[name][rows] for name in self.covariates]
+        signals = np.stack([t, recording.r[rows], recording.u[rows], recording.y[rows], *carried])
+        return Block.from_signals(asset, sequence, signals)
 
 
 class ReplayTransport(Transport):
@@ -126,10 +125,6 @@ class ReplayTransport(Transport):
             self._streams[asset] = stream, at.stream_start
             self._schedule(order, asset, at.sequence + 1)
         self._clock_origin = time.monotonic(), float(self._queue[0][2].t[0]) if self._queue else 0.0
-
-    def covariates(self, asset: str) -> tuple[str, ...]:
-        """Return the names of the covariates that an asset's blocks carry."""
-        return self._streams[asset][0].covariates
 
     def _schedule(self, order: int, asset: str, sequence: int) -> None:
         stream, start = self._streams[asset]

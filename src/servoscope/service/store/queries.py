@@ -35,14 +35,10 @@ def query_history(
     With `last` only the newest of them.
     """
     table, clock = HISTORY_KINDS[kind]
-    query = sa.select(table)
+    query = sa.select(table).where(*tables.within(table.c[clock], span))
     if assets:
         of = table.c.asset if "asset" in table.c else table.c.event["asset"].as_string()  # of a delivery
         query = query.where(of.in_(assets))
-    if span[0] is not None:
-        query = query.where(table.c[clock] >= span[0])
-    if span[1] is not None:
-        query = query.where(table.c[clock] < span[1])
     ties = [column.desc() for column in table.primary_key]
     return store.fetch(query.order_by(table.c[clock].desc(), *ties).limit(last))[::-1]
 

@@ -75,13 +75,11 @@ def read_series(
     """
     if not store.has_sizes:
         raise StoreError(f"{store.name}: has no sizes over time yet, servoscope run makes them of its diagnoses")
-    table, (since, until) = tables.sizes, span
+    table = tables.sizes
     columns = ("kind", "name", "t", "value", "low", "high", "healthy")
-    query = sa.select(*(table.c[column] for column in columns)).where(table.c.asset == asset)
-    if since is not None:
-        query = query.where(table.c.t >= since)
-    if until is not None:
-        query = query.where(table.c.t < until)
+    query = sa.select(*(table.c[column] for column in columns)).where(
+        table.c.asset == asset, *tables.within(table.c.t, span)
+    )
     if name is not None:
         query = query.where(table.c.name == name)
     if chosen := tuple(kinds):

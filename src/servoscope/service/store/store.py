@@ -119,29 +119,23 @@ class Store:
             store = cls(found, engine.create_store_engine(found, lock_timeout_s=lock_timeout_s, write=write))
         except ModuleNotFoundError as error:
             raise StoreError(f"{error.name} is missing, pip install 'servoscope[service]'") from None
-        store._has_lock = has_lock and found.get_backend_name() == "sqlite"
-        if found.get_backend_name() == "sqlite":
+        is_file = found.get_backend_name() == "sqlite"
+        store._has_lock = has_lock and is_file
+        if is_file:
             if not write and not Path(found.database or "").exists():
                 raise StoreError(f"{store.name}: no such store, servoscope run makes it")
             engine.check_folder(Path(str(found.database)))
-        is_file = found.get_backend_name() == "sqlite"
+        # Two processes that begin with an empty file lock each other out for a moment, and a reader may see the file
+        # before its tables. SQLite does not wait there, as one of them would wait for the other for ever.
         end = time.monotonic() + (OPENING_S if is_file and (write or _is_new(found.database)) else 0.0)
         try:
-            store._prepare(write, end)
+            store._version = store._retry(
+                end, lambda connection: schema.create_or_migrate(connection, store.name, write=write)
+            )
         except BaseException:
             store.close()
             raise
         return store
-
-    def _prepare(self, write: bool, end: float) -> None:
-        """Create or migrate the tables.
-
-        Two processes that begin with an empty file lock each other out for a moment, and a reader may see the file
-        before its tables. SQLite does not wait there, as one of them would wait for the other for ever.
-        """
-        self._version = self._retry(
-            end, lambda connection: schema.create_or_migrate(connection, self.name, write=write)
-        )
 
     def _retry(self, end: float, work: Callable[[sa.Connection], Result]) -> Result:
         """Return what some work in a transaction does, tried until `end`, monotonic [s]."""

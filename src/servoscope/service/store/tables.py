@@ -14,6 +14,13 @@ METADATA = sa.MetaData()
 Identity = sa.BigInteger().with_variant(sa.Integer(), "sqlite")  # the only kind that SQLite counts up by itself
 
 
+def within(column: sa.Column[float], span: tuple[float | None, float | None]) -> list[sa.ColumnElement[bool]]:
+    """Return the conditions that a time lies between two others, the second one left out; None: without bound."""
+    since, until = span
+    begun = [] if since is None else [column >= since]
+    return begun if until is None else [*begun, column < until]
+
+
 def _numbered_table(name: str, *columns: sa.Column[object]) -> sa.Table:
     """Return a table of an asset's numbered rows."""
     return sa.Table(

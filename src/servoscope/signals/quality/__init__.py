@@ -7,7 +7,6 @@ state, findings = tick(limits, state, now)              # each second, and with 
 verdict = limit_verdict(verdict, active_findings(state))              # never healthy on bad data
 """
 
-from servoscope.signals.quality.findings import KINDS, QualityFinding, describe_findings, limit_verdict
 from servoscope.signals.quality.monitor import (
     ACTIVE,
     active_findings,
@@ -17,7 +16,14 @@ from servoscope.signals.quality.monitor import (
     restart_silence,
     tick,
 )
-from servoscope.signals.quality.settings import QualityLimits, QualitySettings
+from servoscope.signals.quality.settings import (
+    KINDS,
+    QualityFinding,
+    QualityLimits,
+    QualitySettings,
+    describe_findings,
+    limit_verdict,
+)
 
 __all__ = [
     "ACTIVE",

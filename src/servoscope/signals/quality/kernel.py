@@ -8,8 +8,7 @@ from typing import Any
 from servoscope.core.jit import maximum, minimum, where
 from servoscope.core.jit.array_function import ArrayFunction
 from servoscope.core.jit.arrays import Variable
-from servoscope.signals.quality.findings import KINDS
-from servoscope.signals.quality.settings import QualityLimits
+from servoscope.signals.quality.settings import KINDS, QualityLimits
 from servoscope.signals.timebase import BACKWARD_STEP, GAP_STEP, LATE_SAMPLES
 
 WAITING, SILENT, FROZEN_Y, FROZEN_U, GAP, JITTER, RATE, CLOCK = range(len(KINDS))

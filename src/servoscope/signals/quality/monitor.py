@@ -9,8 +9,7 @@ import numpy.typing as npt
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import RecordingError, StateError
-from servoscope.signals.quality.findings import KINDS, QualityFinding
-from servoscope.signals.quality.settings import QualityLimits
+from servoscope.signals.quality.settings import KINDS, QualityFinding, QualityLimits
 
 SILENT = KINDS.index("silent")
 BUFFER = 64  # findings that the compiled loop returns at a time

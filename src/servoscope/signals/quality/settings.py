@@ -1,14 +1,17 @@
-"""Limits for sound data, from the section `[quality]`: allowed silence, standstill, jitter, gaps and drift."""
+"""What can be wrong with the data of an asset: limits, from the section `[quality]`, and findings beyond them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, NamedTuple
 
 from pydantic import Field
 
 from servoscope.core.errors import RecordingError
+from servoscope.core.messages import Message, message, render
 from servoscope.core.settings import Positive, Settings
 
+KINDS = ("waiting", "silent", "frozen_y", "frozen_u", "gap", "jitter", "rate", "clock")
 Share = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0, lt=1.0)]
 
 MIN_WINDOW_SAMPLES = 200  # samples of a window: fewer do not tell a rate to 0.1 %
@@ -62,3 +65,42 @@ class QualitySettings(Settings):
             missing=self.missing_share,
             rate_error=self.rate_error,
         )
+
+
+class QualityFinding(NamedTuple):
+    """The beginning or the end of something wrong with the data."""
+
+    kind: str  # one of `KINDS`
+    begins: bool  # whether it begins
+    time: float  # when (epoch, s): by the time stamps of the data; of silence by the clock of the service
+    value: float  # value, limit: what was measured, and what is allowed
+    limit: float
+
+    @property
+    def text(self) -> Message:
+        """What it says."""
+        if not self.begins:
+            return message("quality.over", kind=self.kind)
+        at_rest = self.kind == "frozen_y" and self.value == 0.0
+        kind = "frozen_y_at_rest" if at_rest else self.kind
+        return message(f"quality.{kind}", value=self.value, limit=self.limit)
+
+    @property
+    def message(self) -> str:
+        """One line for the user."""
+        return render(self.text)
+
+
+def limit_verdict(verdict: str, active: Iterable[str]) -> str:
+    """Return what is left of a monitor's verdict, given the findings that are active.
+
+    Nothing is healthy on bad data. A fault stays one where samples are missing, which a monitor waits out; any other
+    finding could have made it.
+    """
+    kinds = set(active)
+    return verdict if not kinds or (verdict == "fault" and kinds == {"gap"}) else "undetermined"
+
+
+def describe_findings(active: Iterable[str]) -> str:
+    """Return what is wrong with the data, in a few words."""
+    return ", ".join(render(message(f"quality.short.{kind}")) for kind in active) or render(message("quality.sound"))

@@ -28,7 +28,7 @@ from servoscope.diagnosis.motion_signature import signature_columns
 from servoscope.diagnosis.relearn import relearn
 from servoscope.estimation.frequency_response import ResponseRow, response_rows
 from servoscope.learning import inspection
-from servoscope.learning.proposal import propose
+from servoscope.learning.proposal import init
 from servoscope.models.loop import Columns, Loop
 from servoscope.report import plain_values
 from servoscope.service.relearning import read_stretch
@@ -115,13 +115,14 @@ def propose_file(progress: Progress, file: str, request: requests.ProposalReques
     """Propose a loop file for a recording as `servoscope init` does, and inspect the recording with it."""
     progress("proposing")
     columns = _merge_columns(request.columns, None) if request.columns is not None else None
-    proposal, result = propose(file, columns)
+    proposal = init(file, columns)
+    recording = readers.read(file, proposal.loop)
     lines = [
         {"section": one.section, "key": one.key, "value": one.value, "why": str(one.why), "doubtful": one.doubtful}
         for one in proposal.lines
     ]
-    found = _inspection_result(result, readers.read(file, proposal.loop))
-    return {"toml": proposal.to_toml(file), "lines": lines, **found}
+    found = _inspection_result(inspection.inspect(recording, proposal.loop), recording)
+    return {"toml": proposal.to_toml(), "lines": lines, **found}
 
 
 def _inspection_result(result: inspection.Inspection, recording: Recording) -> JsonObject:

@@ -82,7 +82,7 @@ export async function show(main, { session, signal, linked, values, part: name, 
   let span = SPANS["1 h"];
   let closer = null; // of what is zoomed into, with more of its values
   const live = { t: [], statistic: [], level: [] };
-  const both = plot(statistic, "Both tests over time, as multiples of their limits", (c) => tests(c, curves()), signal, { moved: (part) => near(part).catch(() => {}) });
+  const both = plot(statistic, "Both tests over time, as multiples of their limits", (c) => tests(c, curves()), signal, { clock: true, moved: (part) => near(part).catch(() => {}) });
   let [shown, length, held] = [{ t: [], r: [], u: [], y: [] }, 30, null];
   const traces = plot(samples, "Reference, output and input of the last seconds", (c) => drawn(c, { ...relative(shown), units, name: "time before the last sample [s]" }), signal, { moved: (part) => hold(part).catch(() => {}) });
   const gain = plot(response, "Magnitude and phase over frequency, before and now", (c) => bode(c, asset.responses, units), signal);

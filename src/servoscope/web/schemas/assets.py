@@ -16,7 +16,7 @@ from servoscope.estimation.frequency_response import CHI2_95_2DOF, ResponseRow
 from servoscope.prognosis.series import NORMAL_95
 from servoscope.report.document import to_json
 from servoscope.service.alarms import PRIORITIES, TRANSITION_TABLE, LifecycleEvent, LifecycleState, Ne107
-from servoscope.service.alarms.state_table import UNACKNOWLEDGED_STATES
+from servoscope.service.alarms.records import UNACKNOWLEDGED_STATES
 from servoscope.service.assets.outlook import Outlook
 from servoscope.service.assets.status import AlarmStatus, AssetStatus, FloodCounts, ServiceStatus
 from servoscope.web.asset_document import asset_document, status_headline
