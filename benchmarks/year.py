@@ -1,4 +1,4 @@
-"""A year of one machine: seasons, wear, two repairs, another tool; false alarms, faults found, and slow wear not learned.
+"""A year of one machine: seasons, wear, two repairs, another tool; false alarms, faults found, slow wear refused.
 
 python benchmarks/year.py [--weeks 52] [--hour] [--json]
 
