@@ -124,6 +124,26 @@ def test_between_learned_loads_the_axis_is_healthy_and_a_fault_found(carried: ss
     assert ss.diagnose(one, carry(4.0, 92)).verdict == "fault"
 
 
+def test_a_linear_plant_keeps_its_refit_where_the_load_stays_in_a_recording() -> None:
+    plain = {"kind": "polynomial", "order": 2, "coefficients": {"inertia": 1.0, "viscous_friction": 10.0}}
+    loop = ss.Loop.from_dict({**AXIS, "plant": plain, "sample_rate": 50.0, "columns": CARRIED.columns.model_dump()})
+
+    def record(seed: int, load: float, *faults: FaultEvent) -> ss.Recording:
+        heavier = loop.model_copy(update={"plant": loop.plant.with_ratios({"inertia": 1.0 + 0.1 * load})})
+        made, _ = simulate(heavier, reference("multisine", 20.0, 50.0), seed=seed, faults=faults, **NOISE)
+        return replace(made, channels={"load": np.full(made.samples, load)})
+
+    learned = ss.learn(loop, [record(i, load) for i, load in enumerate((1.0, 3.0, 5.0))])
+    assert learned.exact is not None and learned.exact.misfit <= 1.0
+    (interval,) = ss.diagnose(learned, record(9, 4.0, FaultEvent.parse("viscous_friction=1.3@10"))).intervals
+    assert interval.refit is not None and interval.faults[0].name == "viscous_friction"
+    assert interval.faults[0].ratio == pytest.approx(1.3, rel=0.01)
+
+
+def test_where_the_oil_warms_within_recordings_learn_says_that_there_is_no_refit(warm: ss.Baseline) -> None:
+    assert any(note.key == "learning.no_refit_along" for note in warm.notes)
+
+
 def test_the_monitor_says_the_same_block_by_block(warm: ss.Baseline, tmp_path: Path) -> None:
     warm.save(tmp_path / "baseline.json")
     monitor = ss.Monitor(tmp_path / "baseline.json")

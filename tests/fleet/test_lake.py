@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import halls
 import lakes
 import numpy as np
 import pyarrow as pa
@@ -21,9 +22,10 @@ from commands import one_line, run
 
 from servoscope import fleet
 from servoscope.baseline.baseline import Baseline
-from servoscope.core.errors import OutputError, RecordingError
+from servoscope.core.errors import BaselineError, OutputError, RecordingError
 from servoscope.diagnosis.diagnose import diagnose
 from servoscope.fleet import Plan, day_monitor, read
+from servoscope.fleet.baselines import load_day_monitor
 from servoscope.fleet.day_monitor import DayMonitor, DayState, RowHistory
 from servoscope.fleet.lake import Lake
 from servoscope.fleet.rows import Rows
@@ -42,6 +44,16 @@ def lake(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def done(lake: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Plan, fleet.Fleet]:
     plan = Plan(Lake.open(str(lake)), tmp_path_factory.mktemp("results"), lakes.loop(), by="supply")
     return plan, fleet.run(plan, local(1))
+
+
+def test_a_day_is_followed_at_the_operating_point_of_its_folder(tmp_path: Path) -> None:
+    one, path = halls.baseline().model_copy(update={"point": "cold"}), str(tmp_path / "baseline.json")
+    one.model_copy(update={"others": (one.model_copy(update={"point": "warm"}),)}).save(path)
+    assert load_day_monitor(path, 1, 120.0, "warm").baseline.point == "warm"
+    with pytest.raises(BaselineError, match="has cold, warm: name the folders of the lake point=NAME"):
+        load_day_monitor(path, 1, 120.0)
+    with pytest.raises(BaselineError, match="no operating point 'hot'"):
+        load_day_monitor(path, 1, 120.0, "hot")
 
 
 def entries(output: Path) -> list[dict[str, Any]]:

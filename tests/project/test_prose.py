@@ -109,3 +109,9 @@ def test_each_file_that_a_document_names_exists() -> None:
             if not placeholder and not any((place / path).exists() for place in (*places, page.parent)):
                 missing.append(f"{page.relative_to(PROJECT)}: {path}")
     assert not missing, "\n".join(missing)
+
+
+def test_each_picture_is_shown_by_a_page() -> None:
+    pages = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    pictures = sorted(path for path in (DOCS / "images").rglob("*.*") if path.suffix in (".png", ".svg"))
+    assert pictures and [path.name for path in pictures if f"/{path.name})" not in pages] == []

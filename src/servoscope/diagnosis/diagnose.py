@@ -239,7 +239,7 @@ def diagnose_examination(
     explained = end if at == last else corrected_trace(exam, correction, slice(at, at + 1))
     reasons = build_reasons(exam, explained, interval) if alarm is not None and interval is not None else ()
     if features is not None and changed is not None:
-        reasons = (*reasons, *features.reasons(changed))
+        reasons = (*reasons, *features.reasons(changed, alone=alarm is None))
     diagnosis = Diagnosis(
         **recording_facts(recording),
         verdict=verdict,

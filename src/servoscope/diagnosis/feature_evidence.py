@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from servoscope.baseline.feature_model import FeatureModel, FeatureName
+from servoscope.baseline.feature_model import FeatureModel, FeatureName, GroupStatistic
 from servoscope.baseline.feature_spans import SpanFeatures
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray, IntArray
@@ -77,30 +77,48 @@ class FeatureEvidence:
         at = message("diagnosis.point", name=point) if point else None
         return message("diagnosis.changed", point=at, change=self._changes(span)[0])
 
-    def reasons(self, span: SpanScore) -> tuple[Message, ...]:
-        """Say what differs in a span, and how sure that is."""
+    def reasons(self, span: SpanScore, alone: bool) -> tuple[Message, ...]:
+        """Say what differs in a span, how sure that is, and, if no coefficient has changed, what usually does that."""
         chance = message(
             "diagnosis.features_chance",
             recordings=self.model.recordings,
             guaranteed=self.p_value,
             model=self.model.false_alarms,
         )
-        return message("diagnosis.features", changes=self._changes(span)), chance
+        hints = self._hints(span) if alone else ()
+        return message("diagnosis.features", changes=self._changes(span)), *hints, chance
+
+    def _hints(self, span: SpanScore) -> tuple[Message, ...]:
+        """Say what usually does that: by the signals whose bands have grown, or by means that have moved alone."""
+        ratios = zip(self.model.statistics, self.model.ratios(span.features), strict=True)
+        moved = [
+            (name, off)
+            for one, ratio in ratios
+            if ratio > 1.0
+            for name, _, _, off in self._compare(one, span)
+            if abs(off) >= MIN_STD
+        ]
+        grown = {name.signal for name, off in moved if name.band_hz is not None and off > 0.0}
+        kind = {("u",): "u", ("e", "u"): "both"}.get(tuple(sorted(grown)))
+        if moved and all(name.band_hz is None for name, _ in moved):
+            kind = "mean"
+        return () if kind is None else (message(f"diagnosis.hint_{kind}"),)
 
     def _changes(self, span: SpanScore) -> tuple[Message, ...]:
         """Say which features differ, the most changed first: of which signal, in which motion and band."""
         one = self.model.statistics[int(np.argmax(self.model.ratios(span.features)))]
+        first, *others = sorted(self._compare(one, span), key=lambda row: -abs(row[3]))[:MAX_FEATURES_NAMED]
+        return tuple(_describe(*row[:3]) for row in (first, *(row for row in others if abs(row[3]) >= MIN_STD)))
+
+    def _compare(self, one: GroupStatistic, span: SpanScore) -> list[tuple[FeatureName, float, float, float]]:
+        """Return the features of a group: name, value, what is healthy, by how many standard deviations they differ."""
         (values, _), covariates = one.group.pick(span.features), span.features.covariates
         off, healthy = np.nan_to_num(one.deviations(values, covariates)), one.expected(covariates)
         if one.group.past:  # described by the later windows against the earlier ones
             later = span.features.values[one.group.level, list(one.group.kept)]
             values, healthy = later, later - values + healthy
-        most = np.argsort(-np.abs(off))[:MAX_FEATURES_NAMED].tolist()
-        return tuple(
-            _describe(FeatureName.of(self.model.layout, one.group.kept[k]), float(values[k]), float(healthy[k]))
-            for k in most
-            if abs(off[k]) >= MIN_STD or k == most[0]
-        )
+        names = [FeatureName.of(self.model.layout, feature) for feature in one.group.kept]
+        return list(zip(names, values.tolist(), healthy.tolist(), off.tolist(), strict=True))
 
 
 def mean_of(spans: Sequence[SpanFeatures]) -> SpanFeatures:

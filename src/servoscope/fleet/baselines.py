@@ -71,12 +71,15 @@ def baseline_path(folder: str | Path, name: str) -> str:
 
 
 @lru_cache(maxsize=MAX_CACHED_MONITORS)
-def load_day_monitor(path: str, assets: int, window_s: float) -> DayMonitor:
-    """Return the monitor of a baseline's file, with its share of the budget.
+def load_day_monitor(path: str, assets: int, window_s: float, point: str | None = None) -> DayMonitor:
+    """Return the monitor of a baseline's file at an operating point, with its share of the budget.
 
-    Raises BaselineError if the file is missing or damaged.
+    Raises BaselineError if the file is missing or damaged, or the operating point is.
     """
-    return DayMonitor(Baseline.load(path).shared(assets), window_s)
+    baseline = Baseline.load(path)
+    if baseline.others and point is None:
+        raise BaselineError(f"{path}: has {', '.join(baseline.points)}: name the folders of the lake point=NAME")
+    return DayMonitor((baseline.at(point) if baseline.others and point else baseline).shared(assets), window_s)
 
 
 @lru_cache(maxsize=MAX_CACHED_MONITORS)

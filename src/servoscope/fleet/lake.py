@@ -13,6 +13,7 @@ from servoscope.core.errors import RecordingError
 
 TABLES = (".csv", ".txt", ".tsv")
 ASSET, DAY = "asset", "day"
+POINT = "point"  # the group that names the operating point
 UNDATED_DAY = "all"  # the day of files that name none
 
 

@@ -16,7 +16,7 @@ from servoscope.core.files import atomic_write, make_folder
 from servoscope.core.workers import Progress, WorkerError, Workers
 from servoscope.fleet.baselines import load_day_monitor
 from servoscope.fleet.day_monitor import DayMonitor, DayState, EvaluationBlock, RowHistory
-from servoscope.fleet.lake import AssetDay
+from servoscope.fleet.lake import POINT, AssetDay
 from servoscope.fleet.read import read_blocks
 from servoscope.fleet.rows import MICRO, Rows
 from servoscope.models.loop import Columns, Loop
@@ -123,7 +123,8 @@ class ExamineTask:
         try:
             if self.baseline is None:
                 raise ServoscopeError(f"no baseline: {self.baseline_error}")
-            monitor = load_day_monitor(self.baseline, self.assets, self.window_s)
+            point = dict(self.item.groups).get(POINT)
+            monitor = load_day_monitor(self.baseline, self.assets, self.window_s, point)
             learned = monitor.baseline.loop.columns
             columns = self.columns if self.columns is not None else learned
             if not columns.covariates:  # --columns says where r, u and y are

@@ -176,8 +176,10 @@ def learn_sequential_test(
     It takes the parameters for constant: where they scatter, healthy recordings would be alarms.
     """
     none: tuple[CalibrationFactors, tuple[CusumHypothesis, ...], list[Message]] = CalibrationFactors(), (), []
-    if not plant.holds or not plant.loudest or healthy.loop.monitor.model_error or healthy.covariates is not None:
+    if not plant.holds or not plant.loudest or healthy.loop.monitor.model_error:
         return none
+    if healthy.covariates is not None:
+        return *none[:2], [message("learning.no_test_along", names=healthy.covariates.names)]
     by_chance = homogeneity.scatter_probability(plant.deviations, plant.fit.each_covariance)
     scatters = by_chance <= homogeneity.SCATTER_BY_CHANCE
     if scatters or (healthy.population is not None and not healthy.population.sequential):

@@ -11,7 +11,7 @@ from servoscope.baseline.axis_model import AxisModel, AxisMoves
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.feature_model import FeatureModel
 from servoscope.baseline.motion import learn_motion
-from servoscope.baseline.records import BaselineSource, HealthyScatter, digest
+from servoscope.baseline.records import BaselineSource, ExactPredictorFit, HealthyScatter, digest
 from servoscope.baseline.sensors import learn_sensors
 from servoscope.core.arrays import to_tuples
 from servoscope.core.blas import with_one_blas_thread
@@ -160,9 +160,27 @@ def _assemble_baseline(
 
 
 def _with_exact_predictor(baseline: Baseline, recordings: Sequence[Recording]) -> Baseline:
-    """Covariates are taken out of the regressions, not of the recordings: with them there is none."""
-    exact = None if baseline.covariates is not None else fit_exact_predictor(baseline, recordings)
+    exact = _fit_exact_predictor(baseline, recordings)
     if exact is None or exact.misfit <= 1.0:
         return baseline.model_copy(update={"exact": exact})
-    note = message("learning.no_refit", misfit=exact.misfit)
+    names = baseline.logged_covariates
+    note = (
+        message("learning.no_refit_along", names=names) if names else message("learning.no_refit", misfit=exact.misfit)
+    )
     return baseline.model_copy(update={"exact": exact, "notes": (*baseline.notes, note)})
+
+
+def _fit_exact_predictor(baseline: Baseline, recordings: Sequence[Recording]) -> ExactPredictorFit | None:
+    """With covariates each recording has the plant at its own, and the noise is that of the loudest one."""
+    model = baseline.covariates
+    if model is None:
+        return fit_exact_predictor(baseline, recordings)
+    if model.warm_up is not None:
+        return None
+    means = [{name: float(np.nanmean(rec.channels[name])) for name in model.names} for rec in recordings]
+    fits = [fit_exact_predictor(baseline.at(c), [rec]) for c, rec in zip(means, recordings, strict=True)]
+    known = [fit for fit in fits if fit is not None]
+    if len(known) < len(fits):
+        return None
+    loudest = max(known, key=lambda fit: fit.noise.u_std / fit.noise.y_std)
+    return loudest.model_copy(update={"misfit": max(fit.misfit for fit in known)})
