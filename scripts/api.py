@@ -19,8 +19,8 @@ import servoscope
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "reference" / "api.md"
 SECTIONS = ("Parameters", "Returns", "Raises", "Examples")
 ORDER = (
-    "read", "read_parts", "Recording", "Loop", "inspect", "learn", "relearn", "Baseline", "diagnose", "Diagnosis",
-    "Monitor", "Trace", "plot", "write_report", "NoveltyDetector", "simulate", "design_study",
+    "init", "read", "read_parts", "Recording", "Loop", "inspect", "learn", "relearn", "Baseline", "diagnose",
+    "Diagnosis", "Monitor", "Trace", "plot", "write_report", "NoveltyDetector", "simulate", "design_study",
 )  # fmt: skip
 INTRODUCTION = """# Python, in detail
 

@@ -2,7 +2,7 @@
 
     python benchmarks/accuracy/proposals.py [--count N] [--json]
 
-Three healthy logs are written as CSV; `propose` makes the loop, nothing is edited, `learn` and `diagnose` follow. The
+Three healthy logs are written as CSV; `init` makes the loop, nothing is edited, `learn` and `diagnose` follow. The
 slide of `axis.py` has Coulomb friction that grows to 1.1 to 2 times its value within each log; that of the joint of
 `arm.py`, with gravity and a belt, grows to 1.5 times. Healthy logs are judged as well.
 """
@@ -22,7 +22,6 @@ from tables import Table, parser, show
 
 import servoscope as ss
 from accuracy import arm, axis
-from servoscope.learning.proposal import propose
 
 LEARNED = 3
 RATIOS = 1.1, 2.0  # of Coulomb friction
@@ -53,7 +52,7 @@ def learn_by_init(record: Callable[[int], ss.Recording], unit: str) -> tuple[ss.
     """Return the baseline that `init` and `learn` make of logs, and the plant that was proposed."""
     with tempfile.TemporaryDirectory() as folder:
         logs = [write_log(record(seed), Path(folder) / f"{seed}.csv", unit) for seed in range(LEARNED)]
-        proposal, _ = propose(logs)
+        proposal = ss.init(logs)
         return ss.learn(proposal.loop, [ss.read(log, proposal.loop) for log in logs]), proposal.candidates[0].words
 
 

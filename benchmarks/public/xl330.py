@@ -20,7 +20,7 @@ import servoscope as ss
 from public.servoscope_detector import OURS, with_gain
 from public.simple_detectors import detectors, judge
 from servoscope.learning.axis_fit import fit_axis
-from servoscope.learning.proposal import propose, propose_columns
+from servoscope.learning.proposal import propose_columns
 from servoscope.signals.readers import list_channels
 
 AUTHORS = 71.7  # gravity over inertia with the authors' rotor [1/s^2] (Rhoban, BAM)
@@ -33,7 +33,7 @@ RATES = 185.9, 200.0  # Hz, beside the proposed one: what is learned must not ha
 def proposed_loop(files: list[Path]) -> ss.Loop:
     """Return the loop that `init` proposes with --resample, for the files are logged at two rates."""
     columns = propose_columns(files[0], list_channels(files[0]), None).model_copy(update={"resample": True})
-    return propose(files, columns)[0].loop
+    return ss.init(files, columns).loop
 
 
 def with_axis(loop: ss.Loop, terms: tuple[str, ...], rate: float) -> ss.Loop:

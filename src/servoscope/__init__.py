@@ -29,6 +29,7 @@ __all__ = [
     "assess",
     "design_study",
     "diagnose",
+    "init",
     "inspect",
     "learn",
     "plot",
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
     from servoscope.diagnosis.relearn import relearn
     from servoscope.diagnosis.result import Diagnosis
     from servoscope.learning.inspection import inspect
+    from servoscope.learning.proposal import init
     from servoscope.models.loop import Columns, Loop
     from servoscope.report.diagnosis_page import write_report
     from servoscope.report.plots import plot
@@ -73,6 +75,7 @@ else:  # hidden from type checkers, which would otherwise accept any name
         "assess": "assessment.assess",
         "design_study": "design",
         "diagnose": "diagnosis.diagnose",
+        "init": "learning.proposal",
         "inspect": "learning.inspection",
         "learn": "diagnosis.operating_points",
         "plot": "report.plots",
@@ -93,4 +96,4 @@ else:  # hidden from type checkers, which would otherwise accept any name
         return found
 
     def __dir__() -> list[str]:
-        return sorted({*globals(), *__all__})
+        return sorted({*__all__, "NoveltyDetector"})

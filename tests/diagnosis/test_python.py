@@ -10,7 +10,7 @@ import pytest
 from logs import as_expected, lines, signals, written
 
 import servoscope as ss
-from servoscope.core.errors import RecordingError
+from servoscope.core.errors import OutputError, RecordingError
 from servoscope.models.loop import Columns
 from servoscope.simulation import FaultEvent, reference, simulate
 
@@ -60,6 +60,9 @@ def test_paths_stand_where_objects_do_and_what_comes_is_short(tmp_path: Path) ->
         assert len(text) < 400 and "\n" not in text and text.startswith(type(shown).__name__)
         assert table.startswith("<table><caption>") and table.count("<tr>") >= 3
     assert "verdict: healthy" in repr(diagnosis)
+    lines = str(diagnosis).splitlines()
+    assert len(lines) <= 10 and lines[0].startswith("healthy.csv: 20 s") and lines[1] == "  Healthy: no change found"
+    assert "<img" in diagnosis._repr_html_() and diagnosis.to_frame().empty
     # the same objects as pictures
     fleet = ss.Monitor([tmp_path / "baseline.json", baseline])
     r, u, y = (np.stack([signal, signal]) for signal in (recording.r, recording.u, recording.y))
@@ -98,6 +101,26 @@ def test_paths_stand_where_objects_do_and_what_comes_is_short(tmp_path: Path) ->
         ss.plot(3)  # type: ignore[arg-type]
     judged = ss.write_report(tmp_path / "page.html", tmp_path / "baseline.json", path)
     assert judged == diagnosis and "healthy.csv" in (tmp_path / "page.html").read_text()
+    diagnosis.report(tmp_path / "same.html")
+    assert "healthy.csv" in (tmp_path / "same.html").read_text()
+    back = ss.Diagnosis.model_validate(diagnosis.to_dict())
+    assert back == diagnosis and back.plot()[0].get_title() == "healthy.csv: healthy"
+    with pytest.raises(OutputError, match=r"write_report\(path, baseline, recording\)"):
+        back.report(tmp_path / "none.html")
+
+
+def test_public_names_are_listed() -> None:
+    assert set(dir(ss)) == {*ss.__all__, "NoveltyDetector"}
+
+
+def test_a_log_leads_to_a_loop_file(tmp_path: Path) -> None:
+    loop = ss.Loop.load(RIG)
+    recording = simulate(loop, reference("multisine", 20.0, loop.sample_rate), seed=1)[0]
+    recording.to_frame().rename(columns={"u": "cur"}).to_csv(tmp_path / "log.csv", index=False)
+    proposal = ss.init(tmp_path / "log.csv", "u=cur")
+    proposal.save(tmp_path / "loop.toml")
+    assert str(proposal) == (tmp_path / "loop.toml").read_text() and "log.csv" in str(proposal)
+    assert ss.Loop.load(tmp_path / "loop.toml").columns.input == "cur"
 
 
 def test_a_name_cannot_put_markup_into_a_notebook(tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from servoscope.core.errors import LoopError
 from servoscope.core.messages import render
 from servoscope.estimation.pipeline import Pipeline
 from servoscope.learning.plant_choice import choose_plant
-from servoscope.learning.proposal import propose
 from servoscope.models.plants.axis import AxisPlant
 from servoscope.simulation import FaultEvent, simulate
 
@@ -129,10 +128,10 @@ class TestSpeed:
         head = "time [s],speed setpoint [rpm],actual speed [rpm],torque [Nm]"
         rows = [f"{t:.4f},{r:.6g},{y:.6g},{u:.6g}" for t, r, y, u in zip(one.t, one.r, one.y, one.u, strict=True)]
         (tmp_path / "drive.csv").write_text("\n".join([head, *rows]), encoding="utf-8")
-        proposal, seen = propose(tmp_path / "drive.csv")
+        proposal = ss.init(tmp_path / "drive.csv")
         assert isinstance(proposal.loop.plant, AxisPlant)
         assert (proposal.loop.plant.y, proposal.loop.plant.terms) == ("speed", ("viscous", "coulomb", "offset"))
-        assert seen.verdict == "usable"
+        assert ss.inspect(tmp_path / "drive.csv", proposal.loop).verdict == "usable"
 
 
 @pytest.mark.slow

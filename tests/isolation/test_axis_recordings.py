@@ -119,7 +119,9 @@ def test_healthy_vibration_is_no_fault() -> None:
 def test_eight_raw_files_share_one_pendulum(shared_data: Path) -> None:
     """Free swing and driven motion at four gains; 71.7 1/s^2 with the rotor of the authors (Rhoban, BAM).
 
-    By itself, a file with the free swing gives 67 to 69, and a driven one 53 to 67: no term has the gear's friction.
+    By itself, a file with the free swing gives 68 to 69, and a driven one 51 to 65: no term has the gear's friction.
+    All together give 67.8 under the likeliest noise, and up to 70.6 under one that forgets the force ten times slower
+    and takes over a part of that friction.
     """
     columns = {"time": "timestamp", "reference": "goal_position", "input": "load % 65536", "output": "position"}
     plant = {"kind": "axis", "terms": ["viscous", "coulomb", "gravity", "offset"]}
@@ -129,7 +131,7 @@ def test_eight_raw_files_share_one_pendulum(shared_data: Path) -> None:
     runs = [ss.read(path, loop) for path in sorted((shared_data / "real" / "xl330").glob("*.parquet"))]
     model, _ = fit_axis(loop, runs)
     assert model is not None
-    assert model.coefficients["gravity"] / model.coefficients["inertia"] == pytest.approx(71.7, rel=0.1)
+    assert model.coefficients["gravity"] / model.coefficients["inertia"] == pytest.approx(71.7, rel=0.07)
     left_out = [3, 7]  # the liveliest of both motions; 3 is the file that was refused as stuck
     for k in left_out:
         assert ss.diagnose(ss.learn(loop, runs[:k] + runs[k + 1 :]), runs[k]).verdict == "healthy"

@@ -75,6 +75,12 @@ def test_the_force_is_the_mean_of_a_late_u(drive: DriveLag) -> None:
         assert drive.of_input(u, restart, RATE)[run] == pytest.approx(expected, abs=0.01)
 
 
+def test_a_u_that_runs_in_straight_lines_is_half_a_sample_early() -> None:
+    u, restart = np.array([0.0, 2.0, 6.0, 1.0, 3.0]), np.array([True, False, False, True, False])
+    early = DriveLag(delay_s=-0.5 / RATE).of_input(u, restart, RATE)
+    assert early.tolist() == [1.0, 4.0, 6.0, 2.0, 3.0]  # the last sample of a run knows no next one
+
+
 def test_a_known_mass_tells_the_scale_of_u() -> None:
     coefficients = {name: 7.0 * value for name, value in COEFFICIENTS.items()}  # u in some unit
     plant = loop(payload_arm=0.1, payload_mass=0.5, coefficients=coefficients).plant

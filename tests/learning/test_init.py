@@ -8,8 +8,11 @@ import pytest
 from commands import one_line, run
 from logs import GERMAN_RATE, german_axis
 
+import servoscope as ss
+from servoscope.learning import proposal
 from servoscope.models.loop import Loop
 from servoscope.models.plants.axis import AxisPlant
+from servoscope.signals.readers import csv
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +62,15 @@ def test_several_logs_and_folders_are_one_machine(log: Path, tmp_path: Path) -> 
     assert Loop.load(target).plant.kind == "axis"
 
 
+def test_of_a_long_log_a_part_is_looked_at(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not [note for note in ss.init(log).notes if note.key == "init.part"]
+    monkeypatch.setattr(proposal, "PART_ROWS", 2000)
+    monkeypatch.setattr(csv, "CHUNK_BYTES", 1 << 14)
+    proposed = ss.init(log)
+    (note,) = [note for note in proposed.notes if note.key == "init.part"]
+    assert 2000 <= note.values["rows"] < 4000 and proposed.loop.sample_rate == pytest.approx(GERMAN_RATE)
+
+
 def test_what_may_be_a_covariate_is_mentioned(log: Path, tmp_path: Path) -> None:
     lines = log.read_text(encoding="utf-8").splitlines()
     added = ["Öltemperatur", "°C", *(f"{20.0 + 1e-3 * k:.3f}".replace(".", ",") for k in range(len(lines)))]
@@ -66,13 +78,18 @@ def test_what_may_be_a_covariate_is_mentioned(log: Path, tmp_path: Path) -> None
     path = tmp_path / "warm.csv"
     path.write_text("\n".join(rows), encoding="utf-8")
     told = run("init", path, "-o", tmp_path / "loop.toml")
-    assert told.code == 0 and "if Öltemperatur" in told.out and "covariates" in told.out
+    assert told.code == 0 and "Öltemperatur" in told.out and "a temperature, with which friction" in told.out
+    text = (tmp_path / "loop.toml").read_text(encoding="utf-8")
+    assert Loop.load(tmp_path / "loop.toml").columns.covariates == {}
+    (tmp_path / "loop.toml").write_text(text.replace("# covariates =", "covariates ="), encoding="utf-8")
+    assert Loop.load(tmp_path / "loop.toml").columns.covariates == {"öltemperatur": "`Öltemperatur [°C]`"}
 
 
 def test_rest_that_the_plant_does_not_explain_is_left_out(shared_data: Path, tmp_path: Path) -> None:
     target = tmp_path / "loop.toml"
     told = run("init", shared_data / "real" / "xl330" / "sin_sin_kp100.parquet", "-o", target)
-    assert told.code == 0 and "if input_volts, temp moves what is healthy" in " ".join(told.out.split())
+    out = " ".join(told.out.split())
+    assert told.code == 0 and "temp, " in out and "a temperature, with which" in out
     monitor = Loop.load(target).monitor
     assert monitor.update_when == "moving" and 0.0 < monitor.rest_speed < 0.1
 

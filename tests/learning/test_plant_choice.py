@@ -13,7 +13,7 @@ import servoscope as ss
 from servoscope.core.errors import NotEnoughError
 from servoscope.learning.axis_fit import fit_axis
 from servoscope.learning.plant_choice import PlantCandidate, choose_plant
-from servoscope.learning.proposal import propose
+from servoscope.learning.proposal import init
 from servoscope.simulation import simulate
 
 CONTROLLER = {"kind": "pi", "k_p": 400.0, "k_i": 0.0}
@@ -94,7 +94,7 @@ def test_the_healthy_axis_does_not_depend_on_the_unit_of_y() -> None:
 def test_emps_has_friction_by_direction(shared_data: Path) -> None:
     files = [shared_data / "real" / "emps" / f"{name}.mat" for name in ("DATA_EMPS", "DATA_EMPS_PULSES")]
     for logs in (files[:1], files):
-        proposal, _ = propose(logs)
+        proposal = init(logs)
         assert proposal.candidates[0].settings == {
             "kind": "axis",
             "terms": ["viscous_by_direction", "coulomb", "offset"],
@@ -103,5 +103,5 @@ def test_emps_has_friction_by_direction(shared_data: Path) -> None:
 
 @pytest.mark.slow
 def test_a_hobby_servo_has_friction_by_load(shared_data: Path) -> None:
-    proposal, _ = propose(sorted((shared_data / "real" / "xl330").glob("*.parquet")))
+    proposal = init(sorted((shared_data / "real" / "xl330").glob("*.parquet")))
     assert proposal.candidates[0].settings["terms"] == ["viscous", "gravity", "load_friction", "offset"]

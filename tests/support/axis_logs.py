@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from scipy import signal
 
 import servoscope as ss
 from servoscope.signals import clean
+from servoscope.signals.writers import write_recording
+
+REPAIRED = 1.3  # u of `repaired_axis`, over u of its baseline
 
 RATE, PERIOD_S = 50.0, 4.0
 LOOP = ss.Loop.from_dict(
@@ -37,3 +42,18 @@ def axis(seed: int, seconds: float = 33.0, ripple: float = 0.0, speed: float = 1
     u = force + 0.02 * rng.standard_normal(len(t))
     y = r - 0.01 * force + 1e-4 * rng.standard_normal(len(t))
     return clean(t, r, u, y, name=f"axis-{seed}", sample_rate=RATE)
+
+
+def repaired_axis(folder: Path) -> Path:
+    """Write a service file that follows an axis whose motor was exchanged, and needs more current since."""
+    ss.learn(LOOP, [axis(i, seconds=60.0) for i in range(2)]).save(folder / "axis.json")
+    recording = axis(7, seconds=3000.0)
+    write_recording(folder / "after.csv", ss.Recording(**{**vars(recording), "u": REPAIRED * recording.u}))
+    config = folder / "hall.toml"
+    config.write_text(
+        'name = "hall"\n[service]\nlisten = ""\nlog = "error"\n[store]\nurl = "history.sqlite"\n'
+        "[diagnosis]\nwindow_s = 60.0\nkeep_s = 200.0\nevery_s = 60.0\n"
+        '[sources.line]\nkind = "replay"\nspeed = 20.0\n'
+        '[assets.axis]\nbaseline = "axis.json"\nsource = "line"\nfiles = ["after.csv"]\n'
+    )
+    return config

@@ -190,6 +190,16 @@ def test_the_same_holds_on_loopback_without_login(folder: Path) -> None:
             assert said.status_code == 202 and said.json()["outcome"] is None
 
 
+@pytest.mark.parametrize("empty", [None, "# nothing yet\n"])
+def test_it_starts_with_nothing(tmp_path: Path, empty: str | None) -> None:
+    if empty is not None:
+        (tmp_path / "hall.toml").write_text(empty)
+    given = () if empty is None else ("hall.toml",)
+    with Served(tmp_path, "serve", *given, "--listen", "127.0.0.1:0") as served, served.client() as client:
+        assert client.get("/assets").json()["assets"] == []
+    assert (tmp_path / "history.sqlite").exists()
+
+
 def test_with_tls_the_cookie_is_bound_to_the_host(folder: Path) -> None:
     if shutil.which("openssl") is None:
         pytest.skip("openssl is not on this machine")

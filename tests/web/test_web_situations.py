@@ -244,6 +244,19 @@ def test_a_timeline_shows_what_has_happened(page: Any, address: str, tmp_path: P
         ("Fault", 480.0, 0.0),  # from its onset on, and until now
         ("Diagnoses", 0.0, None),
     ]
+    page.get_by_text("For experts").click()
+    tests = page.get_by_role("img", name="Both tests over time, as multiples of their limits")
+    view = "chart => (({ start, end }) => [start, end])(echarts.getInstanceByDom(chart).getOption().dataZoom[0])"
+    for _ in range(4):
+        page.get_by_role("button", name=f"Zoom in: {label}").click()
+        page.get_by_role("button", name=f"Later: {label}").click()
+    page.wait_for_url("**view-what-has-happened*=93.75%2C100")  # the last 312.5 s
+    start, end = tests.evaluate(view)  # of the 600 s that are shown there
+    assert start == pytest.approx(100.0 * (1.0 - 312.5 / 600.0), abs=1.0) and end == 100.0
+    assert "view-both-tests" not in page.url
+    page.get_by_role("button", name=f"Show all: {label}").click()
+    page.wait_for_url(lambda url: "view-" not in url)
+    assert tests.evaluate(view) == [0.0, 100.0]
 
 
 def _seconds_ago(date: str) -> float | None:

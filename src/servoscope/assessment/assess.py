@@ -67,6 +67,11 @@ class Assessment(ShortRepr, BaseModel):
         Of the loop as the log shows it; at most 100.
     indices
         The textbook indices and log-likelihoods per sample of competing models, by name.
+
+    Examples
+    --------
+    >>> ss.assess("friday.csv").verdict
+    'too tight'
     """
 
     model_config = ConfigDict(frozen=True)

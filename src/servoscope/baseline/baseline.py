@@ -77,6 +77,11 @@ class Baseline(ShortRepr, BaselineMemory):
         others is itself that of the first point.
     revision
         Its place in its history: what was relearned, when, by whom and why.
+
+    Examples
+    --------
+    >>> Baseline.load("baseline.json").names
+    ('viscous_friction', 'inertia', 'coulomb_friction', 'offset')
     """
 
     loop_settings: dict[str, Any] = Field(alias="loop")

@@ -6,6 +6,7 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from servoscope.cli import (  # their commands add themselves to the application
+    add,
     alarms,
     assess,
     baseline,
@@ -14,6 +15,7 @@ from servoscope.cli import (  # their commands add themselves to the application
     fleet,
     init,
     recordings,
+    relearn,
     service,
     simulate_design,
     store,
@@ -25,6 +27,7 @@ from servoscope.cli.app import app, group_commands, main
 group_commands()
 
 __all__ = [
+    "add",
     "alarms",
     "app",
     "assess",
@@ -35,6 +38,7 @@ __all__ = [
     "init",
     "main",
     "recordings",
+    "relearn",
     "service",
     "simulate_design",
     "store",

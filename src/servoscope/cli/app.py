@@ -26,11 +26,13 @@ GROUPS = {
     "Begin": ("demo", "tutorial", "init", "inspect", "docs", "help"),
     "Judge recordings": ("assess", "learn", "baseline", "diagnose", "verify"),
     "Follow machines for months": (
+        "add",
         "run",
         "watch",
         "history",
         "trend",
         "alarms",
+        "relearn",
         "store",
         "serve",
         "users",
@@ -117,6 +119,8 @@ def show_help(
 def show_docs() -> None:
     """Open the documentation that came with this installation in the browser; off a terminal, print where it is."""
     import webbrowser
+    from functools import partial
+    from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
     from pathlib import Path
 
     from servoscope.core.errors import OutputError
@@ -126,8 +130,12 @@ def show_docs() -> None:
     if not page.is_file():
         raise OutputError(say("docs.missing"))
     typer.echo(str(page))
-    if sys.stdout.isatty():
-        webbrowser.open(page.as_uri())
+    if sys.stdout.isatty():  # over HTTP: browsers refuse to load from files what the excerpts of a search are made of
+        with ThreadingHTTPServer(
+            ("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=str(page.parent))
+        ) as server:
+            webbrowser.open(f"http://127.0.0.1:{server.server_port}/")
+            server.serve_forever()
 
 
 def _context_of(whole: Any, name: str) -> Any:

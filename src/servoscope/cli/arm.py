@@ -69,7 +69,7 @@ def diagnose_logs(
     """Diagnose logs of an arm, print the verdicts, and write reports on them."""
     from servoscope.cli.render import diagnosis, results
     from servoscope.diagnosis.arm import examine_arm
-    from servoscope.report import plain_values
+    from servoscope.report import document, plain_values
     from servoscope.report.arm_page import write_arm_page
     from servoscope.signals.readers.arm_log import read_arm_log
 
@@ -83,7 +83,9 @@ def diagnose_logs(
             if as_json:
                 print_json(plain_values.to_plain_values(result), lines=len(logs) > 1)
             else:
-                diagnosis.print_diagnosis(results.create_console(), result, details)
+                diagnosis.print_diagnosis(
+                    results.create_console(), result, document.DETAILS if details else document.EVIDENCE
+                )
             if pages is not None:
                 pages.write(path, recording.name, write_arm_page, result, examination, baseline, stderr=as_json)
     if fail_on_fault and faulty:

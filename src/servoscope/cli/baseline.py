@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import getpass
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -74,8 +74,10 @@ def add_recordings(
         results.print_written_path(results.create_console(), path)
 
 
-def print_difference(before: Baseline, after: Baseline, as_json: bool) -> None:
-    """Print what moved between two baselines, and what each of them can detect."""
+def print_difference(
+    before: Baseline, after: Baseline, as_json: bool, more: Mapping[str, object] | None = None
+) -> None:
+    """Print what moved between two baselines, and what each of them can detect; `more`: in the JSON too."""
     from servoscope.baseline.comparison import compare_baselines
     from servoscope.cli.render import results
     from servoscope.report.format_values import format_percent
@@ -84,7 +86,10 @@ def print_difference(before: Baseline, after: Baseline, as_json: bool) -> None:
     if as_json:
         points = [each.to_dict() for each in differences]
         revision = after.revision.model_dump(mode="json")
-        print_json({"before": before.hash, "after": after.hash, "revision": revision, "points": points}, lines=False)
+        print_json(
+            {"before": before.hash, "after": after.hash, "revision": revision, "points": points, **(more or {})},
+            lines=False,
+        )
         return
     out = results.create_console()
     for each in differences:

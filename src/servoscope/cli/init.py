@@ -40,15 +40,17 @@ def init(
 
     from servoscope.cli.render import results
     from servoscope.core.errors import OutputError, ServoscopeError
-    from servoscope.learning.proposal import propose_columns
+    from servoscope.learning.proposal import PART_ROWS, propose_columns
     from servoscope.report.page import say
     from servoscope.signals import readers
     from servoscope.signals.readers.axes import find_axes
+    from servoscope.signals.readers.table import read_part
 
     log, asks = logs[0], not yes and sys.stdin.isatty() and sys.stdout.isatty()
     reader = arguments.RecordingReader.from_options(None, reading)
     out = results.create_console()
-    channels = readers.list_channels(log, reader.text)
+    with read_part(PART_ROWS):
+        channels = readers.list_channels(log, reader.text)
     if asks and reading.columns is None:
         results.print_channels(out, log, channels)
     axes = [reading.axis] if reading.axis is not None or reading.columns is not None else []
@@ -74,7 +76,10 @@ def init(
                 chosen = propose_columns(log, channels, axis, typer.prompt(say("init.ask_columns")))
             assert chosen is not None, "it was proposed, or asked for"
             changes = {"text": reader.text or chosen.text, "resample": reading.resample or chosen.resample}
-            _propose(out, logs, chosen.model_copy(update=changes), target, asks, reader.where)
+            with read_part(PART_ROWS) as part:
+                _propose(out, logs, chosen.model_copy(update=changes), target, asks, reader.where)
+            cut = [say("init.part", log=name, rows=count) for name, count in part.cut.items()]
+            results.print_notes(out, cut, "blue", "-")
     failures.exit_if_any()
 
 
@@ -87,7 +92,6 @@ def _propose(out: Console, logs: list[Path], columns: Columns, output: Path, ask
     """Print the proposal for logs with its evidence, write it, and inspect the logs with it."""
     from servoscope.cli.render import results
     from servoscope.core.errors import ServoscopeError
-    from servoscope.core.files import atomic_write
     from servoscope.core.messages import render
     from servoscope.learning import inspection
     from servoscope.learning.proposal import propose_loop
@@ -108,7 +112,7 @@ def _propose(out: Console, logs: list[Path], columns: Columns, output: Path, ask
     results.print_notes(out, notes)
     if asks and any(line.doubtful for line in proposal.lines):
         typer.confirm(say("init.confirm"), default=True, abort=True)
-    atomic_write(output, proposal.to_toml(logs[0].name).encode())
+    proposal.save(output)
     results.print_written_path(out, output)
     usable = []
     for log in logs:

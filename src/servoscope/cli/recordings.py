@@ -251,7 +251,7 @@ def diagnose(
     from servoscope.diagnosis.diagnose import diagnose as diagnose_recording
     from servoscope.diagnosis.diagnose import diagnose_with_trace
     from servoscope.diagnosis.verify import provenance
-    from servoscope.report import plain_values, write_diagnosis_page
+    from servoscope.report import document, plain_values, write_diagnosis_page
     from servoscope.signals.writers import write_table
 
     if (of_arm := ArmBaseline.load(baseline)) is not None:
@@ -284,7 +284,9 @@ def diagnose(
                             if as_json:
                                 print_json(plain_values.to_plain_values(result), lines=several)
                             else:
-                                diagnosis.print_diagnosis(out, result, details)
+                                diagnosis.print_diagnosis(
+                                    out, result, document.DETAILS if details else document.EVIDENCE
+                                )
                         if traces is not None and course is not None:
                             traces.write(path, recording.name, write_table, course.table(), stderr=as_json)
                         if pages is not None and course is not None:

@@ -45,27 +45,35 @@ def serve(
     key: Annotated[str | None, typer.Option(metavar="PEM", help="Key of the certificate.")] = None,
     with_parent: Annotated[bool, typer.Option("--with-parent", hidden=True)] = False,
 ) -> None:
-    """Serve pages and HTTP interface over a store; on loopback, without login, unless told otherwise."""
-    if (config is None) == (store is None):
+    """Serve pages and HTTP interface over a store, with nothing a new one; on loopback without login, by default."""
+    if config is not None and store is not None:
         raise typer.BadParameter("give a service file or --store, and not both")
     check_web_extra()
-    from servoscope.service.config import ServiceFile
+    from servoscope.service.config import ServiceFile, StoreSettings
     from servoscope.service.store import Store
     from servoscope.web.server import STORE_TIMEOUT_S, run_server
 
-    service = ServiceFile.load(config) if config is not None else None
+    service = ServiceFile.load(config) if config is not None and not _is_empty(config) else None
     # paths on the command line are relative to the current folder, those in the service file to its own
     paths = {"users": users, "folder": folder, "certificate": certificate, "key": key}
     given = {name: None if path is None else str(Path(path).absolute()) for name, path in paths.items()}
     settings = merge_web_settings(service, {**given, "listen": listen, "hosts": host or None})
-    here = service.folder if service is not None else Path.cwd()
-    url = service.store.url if service is not None else str(store)
+    here = Path.cwd() if config is None else config.absolute().parent
+    url = service.store.url if service is not None else store or StoreSettings().url
     # a store that exists is only read; one that does not is made, so that files can be diagnosed at once
     missing = "://" not in url and not (here / url).exists()
     opened = Store.open(url, here, write=missing, lock_timeout_s=STORE_TIMEOUT_S)
     if missing:
         typer.echo(f"servoscope: {opened.name} is new, and empty until servoscope run follows assets", err=True)
     run_server(settings, opened, service, here, with_parent=with_parent)
+
+
+def _is_empty(config: Path) -> bool:
+    """Tell whether a service file says nothing yet: then the pages lead to the first machine."""
+    from servoscope.core.errors import ConfigError
+    from servoscope.core.settings import parse_toml, read_toml_text
+
+    return not parse_toml(read_toml_text(config, "service file", ConfigError), config, ConfigError)
 
 
 def merge_web_settings(config: ServiceFile | None, given: dict[str, object]) -> WebSettings:

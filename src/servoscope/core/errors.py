@@ -24,7 +24,16 @@ Every message names the file, the row or the key, says what is wrong with it and
 
 
 class ServoscopeError(Exception):
-    """The base of all errors that servoscope raises on purpose; its text is one line for the user."""
+    """The base of all errors that servoscope raises on purpose; its text is one line for the user.
+
+    Examples
+    --------
+    >>> try:
+    ...     ss.read("sunday.csv")
+    ... except ServoscopeError as error:
+    ...     print(error)
+    sunday.csv: no such file, check the path of the recording
+    """
 
 
 class LoopError(ServoscopeError):

@@ -52,7 +52,15 @@ ASSET_COLUMNS = "theta", "covariance", "expected", "statistic", "level", "crosse
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trace(ShortRepr):
-    """The output of a monitor over time, K evaluations; for a fleet all shapes begin with the assets."""
+    """The output of a monitor over time, K evaluations; for a fleet all shapes begin with the assets.
+
+    Examples
+    --------
+    >>> monitor, recording = ss.Monitor("baseline.json"), ss.read("friday.csv", "loop.toml")
+    >>> _, trace = monitor.run(monitor.init(), recording.r, recording.u, recording.y)
+    >>> trace.theta.shape
+    (600, 4)
+    """
 
     t: FloatArray  # in s, shape (K,)
     names: tuple[str, ...]  # of the n coefficients

@@ -14,6 +14,7 @@ from servoscope.baseline.baseline import Baseline
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import RecordingError, SimulationError
 from servoscope.core.messages import Message, message
+from servoscope.detection.louder_noise import find_louder_noise
 from servoscope.detection.onset import Onset, estimate_onset
 from servoscope.detection.signal_defects import find_signal_defect
 from servoscope.detection.trace import UNSEEN_EXCESS, Trace
@@ -33,10 +34,16 @@ from servoscope.diagnosis.result import (
     FinalCoefficient,
     ResponsePoint,
     Verdict,
+    keep_inputs,
     recording_facts,
 )
 from servoscope.diagnosis.sensor_check import check_sensors
-from servoscope.diagnosis.signal_check import describe_correction, leave_undetermined, limit_to_sound_part
+from servoscope.diagnosis.signal_check import (
+    describe_correction,
+    judge_both_sides,
+    leave_undetermined,
+    limit_to_sound_part,
+)
 from servoscope.diagnosis.timeline import trace_timeline
 from servoscope.diagnosis.warnings import (
     covariate_warnings,
@@ -47,7 +54,7 @@ from servoscope.diagnosis.warnings import (
     warm_up_warnings,
     warning_throughout,
 )
-from servoscope.estimation.frequency_response import ResponseRow, response_rows
+from servoscope.estimation.frequency_response import response_rows
 from servoscope.isolation.candidate import UNKNOWN, Candidate
 from servoscope.isolation.isolate import isolate
 from servoscope.signals import MIN_SAMPLES, Recording
@@ -59,8 +66,7 @@ if TYPE_CHECKING:
 
 MIN_CERTAINTY = 0.95  # probability from which a fault is named
 MAX_SIGNAL = 1e60  # of a signal; products of four of them still are numbers
-# probability of an unknown change from which an operating point does not explain a recording
-MIN_UNKNOWN_PROBABILITY = 0.05
+MIN_UNKNOWN_PROBABILITY = 0.05  # of an unknown change, from which an operating point does not explain a recording
 
 
 @with_one_blas_thread
@@ -102,7 +108,8 @@ def diagnose(
     [('lubrication', 1.25)]
     """
     learned = Baseline.of(baseline)
-    return _diagnose_at_point(learned, as_recording(recording, learned.loop), progress, point)[0]
+    diagnosis = _diagnose_at_point(learned, as_recording(recording, learned.loop), progress, point)[0]
+    return keep_inputs(diagnosis, baseline if point is None else learned.at(point), recording)
 
 
 @with_one_blas_thread
@@ -174,6 +181,9 @@ def _judge_signals(
     progress("signals")
     if (reason := describe_correction(points, recording)) is not None:
         return leave_undetermined(rivals[0], reason), rivals[0], None
+    noise = find_louder_noise(recording, baseline.loop.monitor.memory) if baseline.axis is None else None
+    if noise is not None:
+        return judge_both_sides(recording, noise, lambda side: _judge_signals(baseline, side, progress, point))
     found = sorted(
         ((*diagnose_examination(exam, progress), exam) for exam in rivals),
         key=lambda one: (one[0].verdict != "fault", _change_size(one[0])),
@@ -384,16 +394,6 @@ def _final_response(trace: Trace) -> tuple[ResponsePoint, ...]:
     if not len(trace.t):
         return ()
     rows = response_rows(trace.ifrf, trace.ifrf_expected, -1)
-    std = np.sqrt([rows[:, 5], rows[:, 7]])
-    return tuple(
-        ResponsePoint(
-            frequency_hz=row.frequency_hz,
-            real=row.real,
-            imag=row.imag,
-            real_std=real_std,
-            imag_std=imag_std,
-            nominal_real=row.nominal_real,
-            nominal_imag=row.nominal_imag,
-        )
-        for row, real_std, imag_std in zip(map(ResponseRow._make, rows.tolist()), *std.tolist(), strict=True)
-    )
+    columns = np.column_stack([rows[:, :3], np.sqrt(rows[:, [5, 7]]), rows[:, 3:5]])
+    names = ResponsePoint.model_fields
+    return tuple(ResponsePoint(**dict(zip(names, row, strict=True))) for row in columns.tolist())

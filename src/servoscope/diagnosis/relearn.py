@@ -140,7 +140,7 @@ def find_sources(baseline: Baseline, folders: Sequence[Path]) -> tuple[list[Reco
     A file of another number of samples is another recording. Samples that a service kept have their own columns.
     """
     loop, recordings, missing = baseline.loop, list[Recording](), list[str]()
-    own = Columns(output=loop.columns.output, covariates={name: name for name in loop.columns.covariates})
+    own = Columns(covariates={name: name for name in loop.columns.covariates})
     for source in baseline.sources:
         files = [folder / source.name for folder in folders if (folder / source.name).is_file()]
         for file in files:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import computed_field, model_validator
 
+from servoscope.core.above import function_above
+from servoscope.core.errors import OutputError
 from servoscope.core.messages import (
     Message,
     MessageField,
@@ -19,8 +23,10 @@ from servoscope.core.messages import (
     text_message,
 )
 from servoscope.core.short_repr import ShortRepr
+from servoscope.diagnosis.dates import date_timeline
 from servoscope.isolation.candidate import Candidate, FaultEstimate, ResultModel
 from servoscope.signals import Defect, Recording
+from servoscope.signals.recording import frame_of
 
 Verdict = Literal["healthy", "fault", "undetermined"]
 MAX_ALIKE = 3  # defects of one kind that are shown one by one
@@ -208,6 +214,12 @@ class Diagnosis(ShortRepr, ResultModel):
     began, zone
         When the recording began [s since 1970], and UTC, or nothing where its dates are as they are written; None
         where it has no dates.
+
+    Examples
+    --------
+    >>> diagnosis = ss.diagnose("baseline.json", "friday.csv")
+    >>> [(fault.name, round(fault.ratio, 2), round(diagnosis.onset_s[1])) for fault in diagnosis.faults]
+    [('lubrication', 1.25, 40)]
     """
 
     recording: str
@@ -295,13 +307,77 @@ class Diagnosis(ShortRepr, ResultModel):
         """What the candidates rest on; None where the recursion alone found them."""
         return self.current.refit
 
+    def __str__(self) -> str:
+        """Return what `diagnose` prints first: the verdict, what to check, since when, how large, how sure."""
+        return str(function_above("cli.render.diagnosis", "diagnosis_text")(self))
+
+    def _repr_html_(self) -> str:
+        """Return the same as a table for notebooks, with a picture."""
+        return str(function_above("report.diagnosis_page", "render_diagnosis_cell")(self))
+
+    def plot(self, backend: Literal["matplotlib", "plotly"] = "matplotlib") -> Any:
+        """Draw the coefficients over their healthy values, as `servoscope.plot` does.
+
+        Examples
+        --------
+        >>> (axes,) = ss.diagnose("baseline.json", "friday.csv").plot()
+        >>> axes.get_title()
+        'friday.csv: fault'
+        """
+        return function_above("report.plots", "plot")(self, backend)
+
+    def report(self, path: str | Path) -> None:
+        """Write the report on it as one HTML page, as `servoscope.write_report` does.
+
+        Raises OutputError if the page cannot be written, or the diagnosis does not come from `diagnose`.
+
+        Examples
+        --------
+        >>> ss.diagnose("baseline.json", "friday.csv").report("friday.html")
+        """
+        made_of = vars(self).get("made_of")
+        if made_of is None:
+            raise OutputError(
+                f"{path}: only what diagnose returned has a report, write_report(path, baseline, recording)"
+            )
+        function_above("report.diagnosis_page", "write_report")(path, *made_of)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what `diagnose --json` prints, as a dictionary.
+
+        Examples
+        --------
+        >>> ss.diagnose("baseline.json", "friday.csv").to_dict()["faults"][0]["name"]
+        'lubrication'
+        """
+        return dict(json.loads(self.model_dump_json()))
+
+    def to_frame(self) -> Any:
+        """Return the faults as a frame of pandas, a row for each fault of an interval: size, onset, probability.
+
+        Raises RecordingError if pandas is missing.
+
+        Examples
+        --------
+        >>> ss.diagnose("baseline.json", "friday.csv").to_frame()["fault"].tolist()
+        ['lubrication']
+        """
+        rows = []
+        for interval in self.intervals:
+            low, onset, high = interval.onset_s or (None, None, None)
+            when = {"onset_s": onset, "onset_low_s": low, "onset_high_s": high, "end_s": interval.end_s}
+            for fault in interval.faults:
+                size = {"ratio": fault.ratio, "ratio_low": fault.interval[0], "ratio_high": fault.interval[1]}
+                rows.append({"fault": fault.name, **size, **when, "probability": interval.probability})
+        return frame_of(self.recording, [{"recording": self.recording, "verdict": self.verdict, **row} for row in rows])
+
     def dated_headline(self, began: float, onset: float | None = None) -> Message:
         """Return the headline with a date instead of seconds since the recording began, at `began` [UTC s].
 
         `onset`: of a change that is older than the recording, where it is known [UTC s].
         """
         if self.headline.key == "diagnosis.timeline":
-            return _dated_timeline(self.headline, began)
+            return date_timeline(self.headline, began)
         since = self.headline.values.get("since")
         if self.current.onset_s is None or not isinstance(since, Message):
             return self.headline
@@ -313,26 +389,7 @@ class Diagnosis(ShortRepr, ResultModel):
         return self.headline.model_copy(update={"values": {**self.headline.values, "since": since}})
 
 
-DATED = {  # parts of the headline of a timeline: in seconds, and as dates
-    "diagnosis.healed": "diagnosis.healed_date",
-    "diagnosis.stretch_when": "diagnosis.stretch_when_date",
-    "diagnosis.stretch_since": "diagnosis.stretch_since_date",
-    "diagnosis.stretch_until": "diagnosis.stretch_until_date",
-    "diagnosis.stretch_start": "diagnosis.stretch_start_date",
-}
-
-
-def _dated_timeline(headline: Message, began: float) -> Message:
-    """Return the headline of a timeline with dates instead of seconds since `began` [UTC s]."""
-
-    def dated(given: Message) -> Message:
-        times = {name: began + given.values[name] for name in ("t", "from_s", "to_s") if given.values.get(name)}
-        return message(DATED[given.key], began=began, **times)
-
-    stretches = tuple(
-        one.model_copy(update={"values": {**one.values, "when": dated(one.values["when"])}})
-        for one in headline.values["stretches"]
-    )
-    now = headline.values["now"]
-    values = {**headline.values, "stretches": stretches, "now": None if now is None else dated(now)}
-    return headline.model_copy(update={"values": values})
+def keep_inputs(diagnosis: Diagnosis, *inputs: object) -> Diagnosis:
+    """Keep baseline and recording for the report on a diagnosis: no fields, so neither written nor compared."""
+    vars(diagnosis)["made_of"] = inputs
+    return diagnosis

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.messages import Message
+from servoscope.detection.louder_noise import LouderNoise
 from servoscope.detection.signal_defects import SignalDefect, begins_wrong, find_corrections
+from servoscope.diagnosis.bias_correction import BiasCorrection
 from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.explanation import undetermined_headline
 from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, recording_facts
 from servoscope.diagnosis.warnings import warning_throughout
 from servoscope.signals import Recording
+
+# a diagnosis, and what its trace is made of
+Judgement = tuple[Diagnosis, Examination, BiasCorrection | None]
 
 
 def describe_correction(points: Sequence[Baseline], recording: Recording) -> Message | None:
@@ -59,3 +64,23 @@ def limit_to_sound_part(diagnosis: Diagnosis, recording: Recording, defect: Sign
         headline = undetermined_headline(defect.description, diagnosis.point or "")
         update |= {"verdict": "undetermined", "headline": headline}
     return diagnosis.model_copy(update=update)
+
+
+def judge_both_sides(recording: Recording, noise: LouderNoise, judge: Callable[[Recording], Judgement]) -> Judgement:
+    """Return the judgement of a recording in which a signal becomes noisier: that of the first side with a fault.
+
+    Noise in the regressor moves the estimates (errors in variables; Söderström, 2018), which looks like a fault of the
+    plant where it comes within a recording. On the louder side it has been there from the first sample on, and a loop
+    that can be simulated says what it does.
+    """
+    t, k, reason = recording.t, noise.onset, noise.describe(recording.t)
+    diagnosis, exam, correction = judge(recording.part(float(t[0]), float(t[noise.last_quiet])))
+    if diagnosis.verdict != "fault":
+        diagnosis, exam, correction = judge(recording.part(float(t[k]), float(np.nextafter(t[-1], np.inf))))
+        if diagnosis.verdict == "fault" and exam.noise is None:
+            diagnosis = leave_undetermined(exam, reason)
+    warning = DiagnosisWarning(
+        kind="noise", from_s=float(t[k]), to_s=float(t[-1]), count=len(t) - k, description=reason
+    )
+    facts = {"samples": recording.samples, "duration_s": recording.duration_s}
+    return diagnosis.model_copy(update=facts | {"warnings": (*diagnosis.warnings, warning)}), exam, correction

@@ -43,7 +43,8 @@ class DriveLag(NamedTuple):
     def of_input(self, u: FloatArray, restart: BoolArray, sample_rate: float) -> FloatArray:
         """Return the force's mean from each sample to the next, shape (N,), of u that is held; each run begins settled.
 
-        A delay between two samples is the mean of both, which is exact for a u that is held.
+        A delay between two samples is the mean of both, which is exact for a u that is held. It may be negative: by
+        half a sample, u runs in straight lines.
         """
         if not any(self):
             return u
@@ -52,7 +53,8 @@ class DriveLag(NamedTuple):
         k = np.arange(len(u))
         begin = np.maximum.accumulate(np.where(restart, k, 0))
         whole, part = divmod(self.delay_s * sample_rate, 1.0)
-        sooner, later = (u[np.maximum(k - int(whole) - more, begin)] for more in (0, 1))
+        at = (np.clip(k - int(whole) - more, begin, len(u) - 1) for more in (0, 1))
+        sooner, later = (u[np.where(begin[i] > begin, k, i)] for i in at)  # no run reaches into the next one
         u = (1.0 - part) * sooner + part * later
         if self.lag_s * sample_rate < MIN_LAG_SAMPLES:
             return np.asarray(u)

@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from servoscope.core import number_format
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import IrregularTimeError, LoopError, NotEnoughError, RecordingError, ServoscopeError
+from servoscope.core.files import atomic_write
 from servoscope.core.messages import Message, message, render
 from servoscope.core.settings_errors import describe_error
 from servoscope.learning.inspection import Inspection, inspect
@@ -31,32 +32,26 @@ from servoscope.signals.readers.guess_columns import (
     guess_mapping,
     mapping_template,
     names_speed,
+    names_target_torque,
     quoted_channel,
 )
 from servoscope.signals.readers.select import RowFilter
-from servoscope.signals.readers.table import number_column
+from servoscope.signals.readers.table import TableFile, number_column, read_part
 from servoscope.signals.readers.units import split_unit
 from servoscope.signals.readers.wrap import find_wrap
 
+PART_ROWS = 400_000  # of a log, that are looked at; more are read in whole chunks
 MEMORIES = 10.0  # that a recording to learn from should have at least
 MAX_MEMORY_S, MIN_PERIODS = 5.0, 5.0  # of the estimator; periods of the cutoff that it holds at least
 JITTER_PERCENT = 5.0  # of a sample: standard deviation of the steps above which rows are resampled
 SPEED_AXIS = {"kind": "axis", "y": "speed", "terms": ["viscous", "coulomb", "offset"]}
-# what moves the healthy coefficients, by what its name contains
-COVARIATE_STEMS = (
-    "temp",
-    "°c",
-    "degc",
-    "volt",
-    "supply",
-    "pressure",
-    "druck",
-    "pression",
-    "load",
-    "carga",
-    "humid",
-    "温度",
-)
+# what may move the healthy coefficients, by what its name contains
+COVARIATE_STEMS = {
+    "temperature": ("temp", "°c", "degc", "温度"),
+    "supply": ("volt", "supply", "pressure", "druck", "pression"),
+    "load": ("load", "carga", "humid"),
+}
+MIN_SLOW_SHARE = 0.5  # of the variance of a covariate, that lies between memories: what is faster follows the motion
 MAX_SPAN_RATIO = 8.0  # of r over y, or y over r, beyond which one of them is in another unit
 MIN_CLEAR_SHARE = 0.9  # share of u that a plant explains; below it, the choice is in doubt
 
@@ -80,10 +75,18 @@ class LoopProposal:
     lines: tuple[ProposalLine, ...]
     candidates: tuple[PlantCandidate, ...]
     notes: tuple[Message, ...]
+    origin: str  # the log that it was made from
 
-    def to_toml(self, origin: str) -> str:
-        """Return the loop file with comments; `origin`: the log that it was made from."""
-        written = [f"# {render(message('init.origin', log=origin))}"]
+    def __str__(self) -> str:
+        return self.to_toml()
+
+    def save(self, path: str | Path) -> None:
+        """Write the loop file with the reasons as comments; raises OutputError if that fails."""
+        atomic_write(Path(path), self.to_toml().encode())
+
+    def to_toml(self) -> str:
+        """Return the loop file with comments."""
+        written = [f"# {render(message('init.origin', log=self.origin))}"]
         section = ""
         for line in self.lines:
             if line.section != section:
@@ -188,16 +191,18 @@ def propose_loop(paths: Sequence[Path], columns: Columns, where: Mapping[str, st
             ProposalLine("monitor", "update_when", '"moving"', message("init.update_when")),
             ProposalLine("monitor", "rest_speed", repr(speed), message("init.rest_speed")),
         ]
+    further, told = _further_columns(path, columns, where, max(round(memory * rate), 1))
     lines = (
         ProposalLine("", "sample_rate", repr(rate), message("init.rate", samples=recording.samples)),
         *_column_lines(path, columns, wraps, recording),
+        *further,
         *_plant_lines(chosen),
         ProposalLine("monitor", "cutoff", repr(cutoff), message("init.cutoff")),
         ProposalLine("monitor", "memory", repr(memory), message("init.memory", length=recording.duration_s)),
         ProposalLine("monitor", "frequencies", repr(frequencies), message("init.frequencies")),
         *held,
     )
-    return LoopProposal(loop, lines, candidates, (*notes, *_covariate_notes(path, columns)))
+    return LoopProposal(loop, lines, candidates, (*notes, *told), path.name)
 
 
 def _inspect(recording: Recording, is_speed: bool) -> Inspection:
@@ -218,34 +223,90 @@ def _plant_lines(chosen: PlantCandidate) -> list[ProposalLine]:
     return lines
 
 
-def _covariate_notes(path: Path, columns: Columns) -> list[Message]:
-    """Return which other columns may move what is healthy, by their names."""
+def _further_columns(
+    path: Path, columns: Columns, where: Mapping[str, str] | None, memory: int
+) -> tuple[list[ProposalLine], list[Message]]:
+    """Return a line with covariates, and what else columns are, by their names and values.
+
+    `memory`: of the estimator [samples]; what changes within it follows the motion and is no covariate.
+    """
     mapped = " ".join([columns.reference, columns.input, *columns.outputs, columns.time or ""])
-    names = [
-        channel.name
-        for channel in list_channels(path, columns.text)
-        if any(stem in channel.name.casefold() for stem in COVARIATE_STEMS)
-        and channel.name not in mapped
-        and channel.min < channel.max
-    ]
-    return [message("init.covariates", names=names)] if names else []
+    opened = open_file(path, columns.text)
+    moving = [c.name for c in list_channels(path, columns.text) if c.name not in mapped and c.min < c.max]
+    notes = [message("init.target_torque", name=name) for name in moving if names_target_torque(name)]
+    kinds = {
+        name: kind
+        for kind, stems in COVARIATE_STEMS.items()
+        for name in moving
+        if any(stem in name.casefold() for stem in stems) and not names_target_torque(name)
+    }
+    slow = {}
+    for name, values in _column_values(opened, list(kinds), where).items():
+        x = values[np.isfinite(values)]
+        if not x.size or x.min() == x.max():  # in the chosen rows
+            continue
+        blocks = np.array_split(x, max(x.size // memory, 1))
+        if np.var([block.mean() for block in blocks]) >= MIN_SLOW_SHARE * np.var(x):
+            slow[re.sub(r"\W+", "_", split_unit(name)[0]).strip("_").lower() or kinds[name]] = name
+            low, high = float(x.min()), float(x.max())
+            notes.append(message("init.covariate", name=name, low=low, high=high, why=message(f"init.{kinds[name]}")))
+        else:
+            notes.append(message("init.moves", name=name))
+    if not slow:
+        return [], notes
+    value = ", ".join(f"{_quoted(key)} = {_quoted(quoted_channel(name))}" for key, name in slow.items())
+    return [ProposalLine("columns", "# covariates", f"{{{value}}}", message("init.covariates"))], notes
 
 
-def propose(path: str | Path | Sequence[str | Path], columns: Columns | None = None) -> tuple[LoopProposal, Inspection]:
-    """Return a loop for logs, and what `inspect` says of the first one with this loop.
+def _column_values(opened: TableFile, names: Sequence[str], where: Mapping[str, str] | None) -> dict[str, FloatArray]:
+    """Return the chosen rows of some columns of a file."""
+    pieces: dict[str, list[FloatArray]] = {name: [] for name in names}
+    chosen = RowFilter(opened, where or {})
+    for table in opened.iter_chunks({*names, *chosen.columns}) if names else ():
+        rows = chosen.mask(table)
+        for name in names:
+            pieces[name].append(number_column(table, name, "init")[rows])
+    return {name: np.concatenate(values) for name, values in pieces.items()}
+
+
+def init(
+    path: str | Path | Sequence[str | Path],
+    columns: Columns | str | None = None,
+    *,
+    where: Mapping[str, str] | None = None,
+) -> LoopProposal:
+    """Propose a loop from logs: columns, units, sample rate, plant, cutoff and memory, each with its evidence.
 
     Parameters
     ----------
     path
         The log, or several of one machine.
     columns
-        Where the signals stand; None: as the names of the columns suggest.
+        The columns, or what is known of them, as ``"u=cur"``: the others are guessed by the words and units in their
+        names.
+    where
+        Rows to take, as for `read`.
+
+    Returns
+    -------
+    LoopProposal
+        ``.loop``, ``.lines`` with reasons, ``.candidates``, ``.notes``; `print` shows the loop file, ``.save(path)``
+        writes it.
 
     Raises RecordingError if the log cannot be read, nothing moves in it, or no name suggests u or y.
+
+    Examples
+    --------
+    >>> ss.init("monday.csv").loop.sample_rate
+    200.0
     """
     paths = [Path(path)] if isinstance(path, str | Path) else [Path(log) for log in path]
-    proposal = propose_loop(paths, columns or propose_columns(paths[0], list_channels(paths[0])))
-    return proposal, inspect(read(paths[0], proposal.loop), proposal.loop)
+    with read_part(PART_ROWS) as part:
+        if not isinstance(columns, Columns):
+            columns = propose_columns(paths[0], list_channels(paths[0]), given=columns)
+        proposal = propose_loop(paths, columns, where)
+    cut = (message("init.part", log=name, rows=rows) for name, rows in part.cut.items())
+    return replace(proposal, notes=(*proposal.notes, *cut))
 
 
 def _unwrapped_columns(
@@ -263,17 +324,11 @@ def _unwrapped_columns(
             plain[key] = combination
     if len(columns.outputs) > 1:
         plain.pop("output", None)
-    wanted = [name for each in plain.values() for name in each.factors]
-    pieces: dict[str, list[FloatArray]] = {name: [] for name in wanted}
-    chosen = RowFilter(opened, where or {})
-    for table in opened.iter_chunks({*wanted, *chosen.columns}) if wanted else ():
-        rows = chosen.mask(table)
-        for name in wanted:
-            pieces[name].append(number_column(table, name, "init")[rows])
+    values = _column_values(opened, [name for each in plain.values() for name in each.factors], where)
     changes, wraps = {}, {}
     for key, each in plain.items():
         ((name, factor),) = each.factors.items()
-        if (period := find_wrap(np.concatenate(pieces[name]))) is not None:
+        if (period := find_wrap(values[name])) is not None:
             text = f"{quoted_channel(name)} % {period:.16g}"
             changes[key] = text if factor == 1.0 else f"{factor:.15g} * ({text})"
             wraps[key] = period

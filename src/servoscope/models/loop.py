@@ -135,7 +135,13 @@ class MonitorSettings(Settings):
 
 
 class Loop(ShortRepr, Settings):
-    """One closed loop: sampling, columns, plant, controller and how it is monitored."""
+    """One closed loop: sampling, columns, plant, controller and how it is monitored.
+
+    Examples
+    --------
+    >>> Loop.load("loop.toml").sample_rate
+    200.0
+    """
 
     name: NonEmptyStr = "loop"  # what the loop is called in reports
     sample_rate: Positive  # sample rate of r, u and y [Hz]
@@ -234,10 +240,7 @@ class Loop(ShortRepr, Settings):
         if len(set(self.monitor.frequencies)) < len(self.monitor.frequencies):
             raise ValueError("[monitor] frequencies: a frequency stands twice, remove one")
         if self.monitor.hidden_warm_up and self.columns.covariates:
-            raise ValueError(
-                "[monitor] hidden_warm_up: stands for a temperature that is not logged, leave it out beside "
-                "[columns.covariates]"
-            )
+            raise ValueError("[monitor] hidden_warm_up: for where nothing is logged, not beside [columns.covariates]")
         if self.monitor.evaluation_rate > self.sample_rate:
             rates = f"{self.monitor.evaluation_rate:g} Hz is above sample_rate = {self.sample_rate:g} Hz"
             raise ValueError(f"[monitor] evaluation_rate: {rates}, lower it")

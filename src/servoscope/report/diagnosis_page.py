@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,16 +16,19 @@ from servoscope.diagnosis.motion_signature import MotionSignature, SignatureWidt
 from servoscope.diagnosis.result import Diagnosis
 from servoscope.models.loop import Loop
 from servoscope.report.diagnosis_document import LABELS, DiagnosisContext, diagnosis_document
-from servoscope.report.document import DETAILS, Section, to_html
+from servoscope.report.document import DETAILS, HEADLINE, Section, to_html
 from servoscope.report.format_values import DASH, format_clock_time, format_count, format_quantity, format_with_std
-from servoscope.report.page import ResultTable, say, write_page
+from servoscope.report.page import ResultTable, render_page, say, write_page
 from servoscope.report.plain_values import provenance
+from servoscope.report.plots import plot
 from servoscope.signals import Recording
 from servoscope.signals.readers import as_recording
 from servoscope.signals.readers.frames import Source
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+CELL_DPI = 60  # of the picture in a notebook
 
 
 def write_diagnosis_page(
@@ -94,6 +99,23 @@ def render_diagnosis_page(
         name=diagnosis.recording,
         about="" if loop.name == Loop.model_fields["name"].default else f"{translate('on')} {loop.name}",
         size=_recording_size(diagnosis, loop),
+    )
+
+
+def render_diagnosis_cell(diagnosis: Diagnosis) -> str:
+    """Return what a notebook shows of a diagnosis: its verdict, what to check, its sizes, and a picture of them."""
+    sections = [section.drawn() for section in diagnosis_document(diagnosis) if section.level == HEADLINE]
+    picture = ""
+    if diagnosis.parameters:
+        import matplotlib.pyplot as plt  # late: it takes half a second to import
+
+        file = io.BytesIO()
+        figure: Any = plot(diagnosis)[0].figure
+        figure.savefig(file, format="png", dpi=CELL_DPI)
+        plt.close(figure)
+        picture = base64.b64encode(file.getvalue()).decode()
+    return render_page(
+        "notebook.html", d=diagnosis, label=LABELS[diagnosis.verdict], sections=sections, picture=picture
     )
 
 

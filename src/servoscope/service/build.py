@@ -177,7 +177,7 @@ def build_assets(config: ServiceFile) -> dict[str, Asset]:
     resolved: dict[object, AssetLimits] = {}
     assets = {}
     for name, settings in config.assets.items():
-        path, point = config.folder / settings.baseline, settings.point
+        path, point = config.baseline_file(name), settings.point
         if path not in files:
             try:
                 files[path] = Baseline.load(path)

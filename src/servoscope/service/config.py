@@ -66,6 +66,12 @@ class DiagnosisSettings(Settings):
     window_s: Seconds = 120.0  # length of the window [s]
     every_s: Seconds = 600.0  # time between two examinations, where nothing happens [s]
     after_s: Seconds = 10.0  # from a new fault to the full diagnosis of the window around it [s]
+    keep_s: NonNegative = 0.0  # how long samples are kept, from which a baseline is relearned, at least `window_s` [s]
+
+    @property
+    def kept_s(self) -> float:
+        """How long samples are kept [s]."""
+        return max(self.window_s, self.keep_s)
 
 
 class AssetSettings(Settings):
@@ -185,6 +191,16 @@ class ServiceFile(FileSettings):
         for place, value in fixed(self).items():
             if fixed(new)[place] != value:
                 raise ConfigError(f"{place}: cannot be changed while the service runs, start it again")
+
+    def relearned_file(self, asset: str) -> Path:
+        """Return where the baseline of an asset is written that was relearned from the store."""
+        path = self.folder / self.assets[asset].baseline
+        return path.with_name(f"{path.stem}.{asset}.json")
+
+    def baseline_file(self, asset: str) -> Path:
+        """Return the baseline of an asset that is in force: the relearned one, or else that of the service file."""
+        own = self.relearned_file(asset)
+        return own if own.exists() else self.folder / self.assets[asset].baseline
 
     def client_names(self) -> dict[tuple[str, str], str]:
         """Return by what names sources and outlets are known outside, by section and name."""

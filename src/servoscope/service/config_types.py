@@ -103,22 +103,29 @@ class FileSettings(Settings):
     """Settings that are a file of their own; `kind_of_file` is what messages call it."""
 
     kind_of_file: ClassVar[str]
-    _folder: Path = PrivateAttr(default=Path())
+    _file: Path = PrivateAttr(default=Path("settings.toml"))
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
         """Read a file; raises ConfigError if it cannot be read, is not TOML, or a key in it is wrong."""
-        path = Path(path)
+        return cls.parse(read_toml_text(Path(path), cls.kind_of_file, ConfigError), Path(path))
+
+    @classmethod
+    def parse(cls, text: str, path: Path) -> Self:
+        """Return what a text says that is the file of a path, or will be; raises ConfigError as `load` does."""
         try:
-            found = cls.model_validate(
-                parse_toml(read_toml_text(path, cls.kind_of_file, ConfigError), path, ConfigError)
-            )
+            found = cls.model_validate(parse_toml(text, path, ConfigError))
         except ValidationError as error:
             raise ConfigError(f"{path}: {describe_error(error, cls)}") from None
-        found._folder = path.absolute().parent
+        found._file = path.absolute()
         return found
 
     @property
     def folder(self) -> Path:
         """What its paths are relative to."""
-        return self._folder
+        return self._file.parent
+
+    @property
+    def file(self) -> Path:
+        """The file itself."""
+        return self._file

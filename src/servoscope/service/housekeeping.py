@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Protocol
 
 from servoscope.core.errors import AlarmError, StoreUnavailableError
@@ -19,6 +20,7 @@ from servoscope.service.metrics import MetricsContext, ServiceMetrics
 from servoscope.service.notifications import Notifier
 from servoscope.service.sources.message import RejectionCounter
 from servoscope.service.store import CommandOutcome, Row, Store
+from servoscope.service.store.rows import RELEARN
 from servoscope.service.store.series import thin_sizes
 
 DAY_S = 86400.0
@@ -36,6 +38,9 @@ class HousekeepingContext(MetricsContext, Protocol):
     notifier: Notifier
     dispatcher: OutboxDispatcher
     metrics: ServiceMetrics
+
+    def reload(self, path: Path) -> None:
+        """Change to what the service file says now, soon."""
 
     def note_refusal(self, name: str, why: str) -> None:
         """Note that something of an asset came and could not be used."""
@@ -121,6 +126,10 @@ class Housekeeping:
         asset, notifier = service.assets.get(name), service.notifier
         if asset is None and name != notifier.name:
             return  # it belongs to another service on the same store
+        if row["command"] == RELEARN:  # the audit has it already
+            service.reload(service.config.file)
+            service.writer.batch.outcomes[row["id"]] = {"outcome": CommandOutcome(accepted=True).text}
+            return
         now = service.clock.now() if asset is None or asset.state is None else asset.state.position.t
         until = now + document["for_s"] if document.get("for_s") is not None else None
         command = OperatorCommand(LifecycleEvent(row["command"]), row["who"], document.get("why", ""), until)

@@ -15,11 +15,25 @@ from servoscope.signals.defects import Defect
 from servoscope.signals.samples import Samples
 
 
+def frame_of(name: str, data: Any) -> Any:
+    """Return a frame of pandas for what has a name; raises RecordingError if pandas is not installed."""
+    try:
+        import pandas as pd
+    except ModuleNotFoundError:
+        raise RecordingError(f"{name}: a frame needs pandas, pip install pandas") from None
+    return pd.DataFrame(data)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Recording(ShortRepr, Samples):
     """Samples of one asset on one rising clock, of at least 20 rows, as `clean` makes them.
 
     Where the time in the file starts again with a new run, the runs are laid end to end.
+
+    Examples
+    --------
+    >>> ss.read("friday.csv", "loop.toml").part(0.0, 10.0).samples
+    2000
     """
 
     name: str  # what it is called in reports, for example the file's name
@@ -58,11 +72,8 @@ class Recording(ShortRepr, Samples):
 
         Raises RecordingError if pandas is not installed.
         """
-        try:
-            import pandas as pd
-        except ModuleNotFoundError:
-            raise RecordingError(f"{self.name}: a frame needs pandas, pip install pandas") from None
-        return pd.DataFrame({"t": self.t, "r": self.r, "u": self.u, "y": self.y, "run": self.run, **self.channels})
+        columns = {"t": self.t, "r": self.r, "u": self.u, "y": self.y, "run": self.run, **self.channels}
+        return frame_of(self.name, columns)
 
     def __getitem__(self, rows: slice | npt.NDArray[Any]) -> Self:
         """Return some of the rows without the defects; a slice copies nothing."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+
 from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
@@ -9,6 +11,7 @@ from rich.text import Text
 from servoscope.cli.render.results import (
     COLOURS,
     INDENT,
+    create_console,
     print_facts,
     print_notes,
     print_result_table,
@@ -17,29 +20,39 @@ from servoscope.cli.render.results import (
 from servoscope.core.messages import translate
 from servoscope.diagnosis.result import Diagnosis
 from servoscope.report.diagnosis_document import diagnosis_document
-from servoscope.report.document import DETAILS, HEADLINE, Document, Facts, Notes, Section, with_pictures
+from servoscope.report.document import EVIDENCE, HEADLINE, Document, Facts, Notes, Section, with_pictures
 from servoscope.report.format_values import format_duration
 from servoscope.report.page import ResultTable, say
 
+MAX_TEXT_WIDTH = 100  # of what `print` of a diagnosis shows
 
-def print_diagnosis(out: Console, d: Diagnosis, details: bool = False) -> None:
-    """Print a verdict, what to check, what it rests on, and the warnings; with `details` the statistics too."""
+
+def diagnosis_text(d: Diagnosis) -> str:
+    """Return the first part of what is printed: the verdict, what to check, since when, how large, how sure."""
+    out = create_console(file=io.StringIO(), width=MAX_TEXT_WIDTH, color_system=None, force_jupyter=False)
+    with out.capture() as printed:
+        print_diagnosis(out, d, HEADLINE)
+    return "\n".join(line.rstrip() for line in printed.get().splitlines())
+
+
+def print_diagnosis(out: Console, d: Diagnosis, depth: int = EVIDENCE) -> None:
+    """Print a verdict, what to check and what it rests on, down to a level of the document."""
     size = f": {format_duration(d.duration_s)}, {d.samples} {translate('samples')}"
     print_title(out, d.recording, size if d.began is None else f"{size}, {say('cli.dates', zone=d.zone or 'local')}")
-    print_document(out, diagnosis_document(d), COLOURS[d.verdict], details=details)
-    if d.reasons and not details:
+    print_document(out, diagnosis_document(d), COLOURS[d.verdict], depth)
+    if d.reasons and depth == EVIDENCE:
         out.print(Padding(Text(say("cli.folded"), style="dim"), INDENT, expand=False))
 
 
-def print_document(out: Console, document: Document, colour: str, *, details: bool) -> None:
-    """Print the sections of a document without its pictures; the last level only with `details`."""
+def print_document(out: Console, document: Document, colour: str, depth: int) -> None:
+    """Print the sections of a document without its pictures, down to a level."""
     first, *others = with_pictures(document)
     out.print(Padding(Text(first.title[:1].upper() + first.title[1:], style=f"bold {colour}"), INDENT, expand=False))
     # what to do comes before the figures that it rests on
     for section in (*(s for s in others if s.level == HEADLINE), first._replace(title="")):
         _print_section(out, section)
     for section in others:
-        if section.level != HEADLINE and (details or section.level != DETAILS):
+        if HEADLINE < section.level <= depth:
             _print_section(out, section)
 
 

@@ -7,6 +7,7 @@ import math
 import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 from unicodedata import category
 
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -57,9 +58,9 @@ class _TextConsole(Console):
             yield segment if segment.control else segment._replace(text=text)
 
 
-def create_console(*, stderr: bool = False) -> Console:
-    """Return a console on stdout or stderr: without colour when that is no terminal or NO_COLOR is set."""
-    return _TextConsole(stderr=stderr, highlight=False, markup=False, emoji=False)
+def create_console(**options: Any) -> Console:
+    """Return a console on stdout, or as the options of Rich say: no colour where there is no terminal, or NO_COLOR."""
+    return _TextConsole(highlight=False, markup=False, emoji=False, **options)
 
 
 def print_title(out: Console, name: str, text: str) -> None:

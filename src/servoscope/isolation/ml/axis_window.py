@@ -264,6 +264,8 @@ def axis_signals(
     restart = recording.restart.copy()
     restart[0] = True
     u = delay_input(plant_input(loop, recording.u), restart, round(loop.delay * loop.sample_rate))
+    if loop.hold == "foh":  # the mean until the next sample is that of both
+        drive = drive._replace(delay_s=drive.delay_s - 0.5 / loop.sample_rate)
     u = drive.of_input(u, restart, loop.sample_rate)
     factors = None if moves is None else moves.factors(plant, recording.channels)
     return AxisSignals.thinned(u, recording.y, restart, loop.sample_rate, stride, plant.derivative, factors)

@@ -86,7 +86,7 @@ class Asset(StateHolder):
         self._limits = policy.quality.limits(self._rate, policy.pause_s)
         self.lanes = BlockLanes(self._rate, self._limits, policy.residual_every_s)
         self._alarms = AssetAlarms(policy.alarms, policy.prognosis.ahead_s, limited=bool(policy.limits))
-        self._window = RecentBlocks(name, policy.diagnosis.window_s, self._rate)
+        self._window = RecentBlocks(name, policy.diagnosis.kept_s, self._rate)
         self._result = StepResult([], [])
         self._reception = RECEPTION_OK
         self._ticked = False  # whether silence has changed the state since the last block
@@ -134,7 +134,7 @@ class Asset(StateHolder):
         self.state = replace(state, alarms=alarms, quality=quality.restart_silence(state.quality, t))
         position, blocks = state.position, list(stored)
         counted = [one for one in blocks if one.sequence < position.blocks]
-        self._window = RecentBlocks(self.name, self.policy.diagnosis.window_s, self._rate, counted)
+        self._window = RecentBlocks(self.name, self.policy.diagnosis.kept_s, self._rate, counted)
         ahead = position.sequence - position.blocks + 1  # of the sender's numbers; all are of one stream
         return [
             replace(one, sequence=one.sequence + ahead, stream=position.stream)

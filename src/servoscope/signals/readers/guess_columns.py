@@ -220,6 +220,12 @@ def names_speed(channel: str) -> bool:
     return split_unit(column)[1] in SPEEDS or bool(_words(column) & SPEED_WORDS)
 
 
+def names_target_torque(column: str) -> bool:
+    """Tell whether a column is a torque, force or current that is asked for, and not measured."""
+    words = _words(column)
+    return bool(words & QUANTITIES) and bool(words & {*WORDS["r"], *COMMAND})
+
+
 def mapping_template(fields: Mapping[str, Any]) -> str:
     """Return ``--columns`` with what is known of a file, and ... where somebody has to say it."""
     known = format_mapping({**fields, **{field: fields[field] or "..." for field in FIELDS.values()}})

@@ -115,6 +115,11 @@ def read_parts(
     """Read several recordings out of one file, one per value of the column `by`, in the order of appearance.
 
     Parameters and errors are those of `read`; a recording is called ``file.csv[run=6]``. Without `by`, there is one.
+
+    Examples
+    --------
+    >>> [part.name for part in read_parts("friday.csv", "loop.toml")]
+    ['friday.csv']
     """
     loop = None if loop is None else Loop.of(loop)
     columns = columns or (loop.columns if loop is not None else Columns())

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -237,9 +239,13 @@ class TableFile:
 
         Raises RecordingError if the file is damaged or has no rows.
         """
+        part = _part.get()
         rows, also = 0, {alias: name for alias, name in self.aliases.items() if alias in wanted}
         places = {*wanted, *also.values()}
         for table in self.read_chunks([name for name in self.columns if name in places], texts):
+            if part is not None and rows >= part.rows:
+                part.cut[self.name] = rows
+                break
             rows += table.rows
             if table.rows and also:
                 table = replace(table, columns={**table.columns, **{a: table.columns[n] for a, n in also.items()}})
@@ -247,6 +253,27 @@ class TableFile:
                 yield table
         if not rows:
             raise EmptyRecordingError(f"{self.path}: holds no rows")
+
+
+@dataclass(frozen=True)
+class Part:
+    """How much is read of a file: so many rows, in whole chunks; `cut`: rows that were read of those that have more."""
+
+    rows: int
+    cut: dict[str, int] = field(default_factory=dict)
+
+
+_part: ContextVar[Part | None] = ContextVar("part", default=None)
+
+
+@contextmanager
+def read_part(rows: int) -> Iterator[Part]:
+    """Read no more than about so many rows of each file, in this thread for a while."""
+    before = _part.set(part := Part(rows))
+    try:
+        yield part
+    finally:
+        _part.reset(before)
 
 
 def shorten_error(error: Exception) -> str:

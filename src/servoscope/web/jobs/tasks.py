@@ -17,6 +17,7 @@ import numpy as np
 from servoscope.assessment.assess import assess
 from servoscope.assessment.tags import find_loops
 from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.comparison import compare_baselines
 from servoscope.core.errors import RecordingError
 from servoscope.core.workers import Progress
 from servoscope.design import design_study
@@ -24,11 +25,13 @@ from servoscope.detection.trace import Trace
 from servoscope.diagnosis import operating_points
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.diagnosis.motion_signature import signature_columns
+from servoscope.diagnosis.relearn import relearn
 from servoscope.estimation.frequency_response import ResponseRow, response_rows
 from servoscope.learning import inspection
-from servoscope.learning.proposal import propose
+from servoscope.learning.proposal import init
 from servoscope.models.loop import Columns, Loop
 from servoscope.report import plain_values
+from servoscope.service.relearning import read_stretch
 from servoscope.signals import Recording, readers
 from servoscope.signals.readers.axes import find_axes, signal_names
 from servoscope.signals.readers.formats import open_file
@@ -112,13 +115,14 @@ def propose_file(progress: Progress, file: str, request: requests.ProposalReques
     """Propose a loop file for a recording as `servoscope init` does, and inspect the recording with it."""
     progress("proposing")
     columns = _merge_columns(request.columns, None) if request.columns is not None else None
-    proposal, result = propose(file, columns)
+    proposal = init(file, columns)
+    recording = readers.read(file, proposal.loop)
     lines = [
         {"section": one.section, "key": one.key, "value": one.value, "why": str(one.why), "doubtful": one.doubtful}
         for one in proposal.lines
     ]
-    found = _inspection_result(result, readers.read(file, proposal.loop))
-    return {"toml": proposal.to_toml(file), "lines": lines, **found}
+    found = _inspection_result(inspection.inspect(recording, proposal.loop), recording)
+    return {"toml": proposal.to_toml(), "lines": lines, **found}
 
 
 def _inspection_result(result: inspection.Inspection, recording: Recording) -> JsonObject:
@@ -199,6 +203,35 @@ def learn_baseline(
     )
     baseline.save(Path(out) / "baseline.json")
     return {"summary": plain_values.replace_nan(plain_values.baseline_summary(baseline)), "recordings": rows}
+
+
+def relearn_baseline(
+    progress: Progress,
+    baseline_file: str,
+    stretch: str,
+    request: requests.RelearningRequest,
+    point: str,
+    who: str,
+    out: str,
+) -> JsonObject:
+    """Learn a baseline anew with samples of the store into the folder `out`, and say what differs."""
+    before = Baseline.load(baseline_file)
+    recording = read_stretch(Path(stretch), before)
+    learned = relearn(
+        baseline_file,
+        {point: [recording]},
+        progress,
+        after=request.after,
+        who=who,
+        why=request.why,
+        accept_change=request.accept_change,
+        folders=[Path(stretch).parent],
+        leave_out=True,
+        save=False,
+    )
+    learned.save(Path(out) / "baseline.json")
+    points = [each.to_dict() for each in compare_baselines(before, learned)]
+    return {"points": points, "notes": [str(note) for note in learned.notes], "duration_s": recording.duration_s}
 
 
 def study_design(

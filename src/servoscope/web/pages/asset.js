@@ -14,6 +14,7 @@ import { badge, priority, prose, STATUS, VERDICTS } from "./marks.js";
 import { parameters } from "./parameters.js";
 import { periods } from "./periods.js";
 import { planes } from "./planes.js";
+import { relearning } from "./relearn.js";
 import { timeline } from "./timeline.js";
 import { capital, count, DASH, moment, multiple, number, plain } from "./words.js";
 
@@ -37,6 +38,7 @@ export async function show(main, { session, signal, linked, values, part: name, 
   const said = h("p", { class: "working", role: "status" });
   const [standing, past, diagnoses, counted] = [h("div", {}), h("div", {}), h("div", {}), h("p", { class: "note" })];
   const certainty = h("div", {});
+  const learned = relearning(path, session, () => asset, signal);
   const [response, motion, widths] = [h("div", { class: "plot" }), h("div", { class: "plot" }), h("p", { class: "note" })];
   const signed = section("Motion signature", "Mean input over position, forward (solid) and backward (dashed), and over speed: the gap between the two directions is friction.", motion, widths);
   const compared = periods(path, () => asset, values, signal);
@@ -55,6 +57,7 @@ export async function show(main, { session, signal, linked, values, part: name, 
       { class: "columns" },
       half(section("Alarms", null, standing, said, past)),
       half(section("Diagnoses", null, diagnoses)),
+      learned.element,
       happened.element,
       grown.element,
       half(titled("Signals", lengths, samples)),
@@ -79,7 +82,7 @@ export async function show(main, { session, signal, linked, values, part: name, 
   let span = SPANS["1 h"];
   let closer = null; // of what is zoomed into, with more of its values
   const live = { t: [], statistic: [], level: [] };
-  const both = plot(statistic, "Both tests over time, as multiples of their limits", (c) => tests(c, curves()), signal, { moved: (part) => near(part).catch(() => {}) });
+  const both = plot(statistic, "Both tests over time, as multiples of their limits", (c) => tests(c, curves()), signal, { clock: true, moved: (part) => near(part).catch(() => {}) });
   let [shown, length, held] = [{ t: [], r: [], u: [], y: [] }, 30, null];
   const traces = plot(samples, "Reference, output and input of the last seconds", (c) => drawn(c, { ...relative(shown), units, name: "time before the last sample [s]" }), signal, { moved: (part) => hold(part).catch(() => {}) });
   const gain = plot(response, "Magnitude and phase over frequency, before and now", (c) => bode(c, asset.responses, units), signal);
@@ -206,7 +209,7 @@ export async function show(main, { session, signal, linked, values, part: name, 
   );
   const timer = setInterval(() => sample().catch(() => {}), SIGNALS_EVERY_MS);
   signal.addEventListener("abort", () => clearInterval(timer));
-  await Promise.all([chosen(span).then(() => (plane.past(past24), plane.take(asset.responses, asset.t, began(asset)))), look(), sample()]);
+  await Promise.all([learned.load(), chosen(span).then(() => (plane.past(past24), plane.take(asset.responses, asset.t, began(asset)))), look(), sample()]);
 }
 
 // Since when there is a fault.

@@ -2,6 +2,7 @@
 import { h, save, translate } from "./dom.js";
 
 const STEP = 0.5; // of what is seen, by one press
+const dated = new Set(); // charts over the time of day: they look at the same part of it
 
 // Zoom by Ctrl and the wheel or two fingers, pan by dragging; what is left out of view still shapes the lines. A finger
 // that moves up or down scrolls the page (touch-action in the style sheet): charts are as wide as a phone.
@@ -12,7 +13,7 @@ export function zoomed({ xAxis, yAxis, tooltip }) {
   return [{ ...inside, xAxisIndex: every(xAxis) }, ...(plane ? [{ ...inside, yAxisIndex: every(yAxis) }] : [])];
 }
 
-export function tools(chart, label, { image, csv, moved, signal }) {
+export function tools(chart, label, { image, csv, moved, clock, signal }) {
   const key = `view-${label.toLowerCase().replace(/[^a-z0-9]+/g, "-")}`;
   const all = () => chart.getOption().dataZoom.map(({ start, end }) => [start, end]);
   const go = (spans) => spans.forEach(([start, end], dataZoomIndex) => chart.dispatchAction({ type: "dataZoom", dataZoomIndex, start, end }));
@@ -34,12 +35,27 @@ export function tools(chart, label, { image, csv, moved, signal }) {
     whole ? told.delete(key) : told.set(key, spans.flat().map((each) => Number(each.toFixed(3))).join());
     history.replaceState(null, "", told.size ? `${location.pathname}?${told}` : location.pathname);
     const { startValue, endValue } = chart.getOption().dataZoom[0];
-    moved?.(whole ? null : [startValue, endValue]);
+    const seen = whole ? null : [startValue, endValue];
+    moved?.(seen);
+    if (clock) for (const other of dated) if (other !== follow) other(seen);
   }
 
+  // What another chart looks at, as far as there is something of it here; only that chart's view goes into the address.
+  let led = false;
+  function follow(seen) {
+    const { min, max } = chart.getOption().xAxis[0];
+    const [start, end] = seen ? [Math.max(seen[0], min ?? seen[0]), Math.min(seen[1], max ?? seen[1])] : [];
+    if (seen && !(start < end)) return;
+    led = true;
+    chart.dispatchAction({ type: "dataZoom", dataZoomIndex: 0, ...(seen ? { startValue: start, endValue: end } : { start: 0, end: 100 }) });
+    led = false;
+    moved?.(seen && [start, end]);
+  }
+  if (clock) dated.add(follow);
+
   let waiting = 0;
-  chart.on("datazoom", () => (clearTimeout(waiting), (waiting = setTimeout(remember, 200))));
-  signal.addEventListener("abort", () => clearTimeout(waiting));
+  chart.on("datazoom", () => led || (clearTimeout(waiting), (waiting = setTimeout(remember, 200))));
+  signal.addEventListener("abort", () => (clearTimeout(waiting), dated.delete(follow)));
   const before = new URLSearchParams(location.search).get(key)?.split(",").map(Number);
   if (before?.length && before.length % 2 === 0 && before.every(Number.isFinite)) go(Array.from({ length: Math.min(before.length / 2, all().length) }, (_, i) => before.slice(2 * i, 2 * i + 2)));
   return h(

@@ -21,8 +21,8 @@ export function colours() {
 
 // A plot in an element of fixed height. `describe(colours)` returns an option; call `draw` when its data have changed.
 // Beneath it stand zoom, pan and export; `csv` returns the values as text, else those that are drawn are saved, and
-// `moved` hears what part of the first axis is looked at: [from, to], null for all of it.
-export function plot(element, label, describe, signal, { csv = null, moved = null } = {}) {
+// `moved` hears what part of the first axis is looked at: [from, to], null for all of it. With `clock`, charts zoom together.
+export function plot(element, label, describe, signal, { csv = null, moved = null, clock = false } = {}) {
   const chart = globalThis.echarts.init(element, null, { renderer: "canvas" });
   let wanted = 0;
   const now = () => {
@@ -49,7 +49,7 @@ export function plot(element, label, describe, signal, { csv = null, moved = nul
     chart.dispose();
   });
   now();
-  element.after(tools(chart, label, { image, csv, moved, signal }));
+  element.after(tools(chart, label, { image, csv, moved, clock, signal }));
   return one;
 }
 

@@ -24,7 +24,7 @@ export function growth(path, name, asset, { session, values, signal }) {
   const element = titled("How it grows", [which, limit, ...buttons], said, advised, picture, why, noted, mayChange(session.role, "operator") && noting());
   let span = SPANS[values.get("span")] === undefined ? "60 d" : values.get("span");
   let [curves, forecast, notes, limits] = [[], null, [], []];
-  const chart = plot(canvas, "Size over time, with its 95 % interval", (c) => drawn(c, shown()), signal, { csv: table });
+  const chart = plot(canvas, "Size over time, with its 95 % interval", (c) => drawn(c, shown()), signal, { clock: true, csv: table });
 
   // All curves of what is chosen as one, in the order of time.
   function rows() {

@@ -17,7 +17,7 @@ export function timeline(path, asset, signal) {
   const canvas = h("div", { class: "plot" });
   const element = section("Timeline", "Bars: how long something lasted. Marks: what was done, noted and found.", canvas);
   let entries = []; // { row, from, to, words }; a mark has no `to`, what still lasts has null
-  const chart = plot(canvas, "What has happened to this asset over time", (c) => drawn(c, entries, asset()), signal, { csv: () => table(entries, asset()) });
+  const chart = plot(canvas, "What has happened to this asset over time", (c) => drawn(c, entries, asset()), signal, { clock: true, csv: () => table(entries, asset()) });
 
   async function load(diagnoses) {
     const [alarms, { notes }] = await Promise.all([get(query(`${path}/alarms`, { last: STEPS }), signal), get(`${path}/notes`, signal)]);

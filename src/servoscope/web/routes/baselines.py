@@ -48,8 +48,12 @@ def asset_baseline_id(context: Context, asset: str) -> str | None:
     config = context.config
     if config is None or asset not in config.assets:
         return None
+    path = config.baseline_file(asset)
+    if path == config.relearned_file(asset):
+        return SERVICE_PREFIX + asset
     file = config.assets[asset].baseline
-    return SERVICE_PREFIX + next(name for name, one in config.assets.items() if one.baseline == file)
+    names = (name for name, one in config.assets.items() if one.baseline == file)
+    return SERVICE_PREFIX + next(name for name in names if config.baseline_file(name) == path)
 
 
 def find_baseline(context: Context, id_: str) -> BaselineFile:
@@ -62,9 +66,9 @@ def find_baseline(context: Context, id_: str) -> BaselineFile:
     config, asset = context.config, id_.removeprefix(SERVICE_PREFIX)
     if config is None or asset_baseline_id(context, asset) != id_:
         raise HTTPException(404, f"there is no baseline {id_}")
-    file = config.assets[asset].baseline
-    path = config.folder / file
-    sharing = [name for name, one in config.assets.items() if one.baseline == file]
+    path, file = config.baseline_file(asset), config.assets[asset].baseline
+    alike = [name for name, one in config.assets.items() if one.baseline == file]
+    sharing = [name for name in alike if config.baseline_file(name) == path]
     facts = _baseline_facts(load_cached(path))
     return BaselineFile(
         path, responses.BaselineRow(id=id_, name=path.name, origin="service", assets=sharing, **dict(facts))

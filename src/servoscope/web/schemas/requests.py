@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from servoscope.baseline.records import Occasion
 from servoscope.diagnosis.result import Verdict
 
 Text = Annotated[str, Field(max_length=1000)]
@@ -93,6 +94,24 @@ class NoteRequest(ApiRequest):
     t: UtcSeconds
     text: Annotated[str, Field(min_length=1, max_length=200)]
     anew: bool = False
+    kind: Literal["note"] | Occasion = "note"
+
+
+class RelearningRequest(ApiRequest):
+    """What to learn an asset's baseline from: its samples of a time [UTC s], and what was done before."""
+
+    since: UtcSeconds | None = Field(None, alias="from")
+    until: UtcSeconds | None = Field(None, alias="to")
+    after: Occasion | None = None
+    why: Annotated[str, Field(max_length=200)] = ""
+    accept_change: bool = False
+
+
+class TakeRequest(ApiRequest):
+    """The preview whose baseline is put in force; None: one step back, for a reason."""
+
+    learning: Id | None = None
+    why: Annotated[str, Field(max_length=200)] = ""
 
 
 class RowQuery(TimeQuery):

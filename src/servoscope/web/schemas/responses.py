@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from servoscope.baseline.records import Occasion
 from servoscope.diagnosis.result import Verdict
 from servoscope.service.access import Role
 from servoscope.web.stored_diagnosis import stored_headline
@@ -296,6 +297,17 @@ class LearningRow(StorageRecord):
     kind = "learnings"
 
     uploads: list[str]
+
+
+class RelearningState(ApiResponse):
+    """How far an asset is in learning `after` what was noted at `since` [UTC s], and which baseline is in force."""
+
+    after: Occasion | None
+    since: float | None
+    learned_s: float
+    needed_s: float
+    revision: int
+    can_go_back: bool
 
 
 class LoopRow(ApiResponse):

@@ -38,6 +38,7 @@ class Note(NoteRequest, ApiResponse):
     model_config = ConfigDict(extra="ignore")  # of later versions
 
     who: str
+    kind: str = "note"  # type: ignore[assignment]
 
 
 class NoteList(ApiResponse):

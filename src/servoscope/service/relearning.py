@@ -1,0 +1,154 @@
+"""An asset's baseline relearned from the samples in the store: how far it is, a preview, and how it is put in force."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.history import history_folder, replace_baseline, step_back
+from servoscope.baseline.records import RENEWALS, Occasion
+from servoscope.core.errors import BaselineError, StoreError
+from servoscope.core.files import make_folder
+from servoscope.models.loop import Columns
+from servoscope.prognosis.series import NORMAL_95
+from servoscope.service.assets.examination import blocks_to_recording
+from servoscope.service.assets.status import AssetStatus
+from servoscope.service.config import ServiceFile
+from servoscope.service.sources.block import Block
+from servoscope.service.store import Store
+from servoscope.service.store.rows import NOTE, RELEARN
+from servoscope.service.store.series import read_notes, read_series
+from servoscope.signals import Recording, readers
+from servoscope.signals.writers import write_recording
+
+MIN_LEARN_S = 600.0  # length of a stretch that is enough to learn from [s], unless fewer samples are kept
+JUDGED_AGAIN_S = 28 * 86400.0  # of past values that a preview judges again [s]
+BASELINE_NOTE = "baseline"  # kind of the note that a baseline was put in force
+
+
+class LearningProgress(NamedTuple):
+    """How far an asset is after what was announced: `after` and `since` of the note, None where there is none."""
+
+    after: Occasion | None
+    since: float | None  # [UTC s]
+    learned_s: float  # samples since then
+    needed_s: float
+    revision: int  # number of the baseline in force
+    can_go_back: bool
+
+
+class PastVerdicts(NamedTuple):
+    """Stored values of the coefficients that are certainly beyond the limit of T^2, by the old and the new baseline."""
+
+    values: int
+    before: int
+    after: int
+
+
+def learning_progress(config: ServiceFile, store: Store, asset: str, status: AssetStatus) -> LearningProgress:
+    """Return how far the learning of an asset is; raises BaselineError if its baseline cannot be read."""
+    revision = Baseline.load(config.baseline_file(asset)).revision
+    notes = [note for note in read_notes(store, asset) if note.get("kind", NOTE) != NOTE]
+    kept_s = config.diagnosis.kept_s
+    known = min(MIN_LEARN_S, kept_s), revision.number, revision.parent > 0
+    if not notes or notes[-1]["kind"] == BASELINE_NOTE:
+        return LearningProgress(None, None, 0.0, *known)
+    last = notes[-1]
+    return LearningProgress(last["kind"], last["t"], min(max(status.position.t - last["t"], 0.0), kept_s), *known)
+
+
+def stored_stretch(
+    config: ServiceFile, store: Store, asset: str, since: float | None, until: float | None = None
+) -> Recording:
+    """Return the samples of an asset that the store keeps of a time [UTC s], under the name that its file is to have.
+
+    Raises StoreError if there are none, RecordingError if they cannot be used.
+    """
+    blocks = [Block.unpack(asset, *row) for row in store.recent_samples(asset)]
+    first, last = since if since is not None else -np.inf, until if until is not None else np.inf
+    blocks = [block for block in blocks if block.t[0] >= first and block.t[-1] < last]
+    if not blocks:
+        raise StoreError(f"{asset}: the store keeps no samples of that time, see [diagnosis] keep_s")
+    baseline, point = Baseline.load(config.baseline_file(asset)), config.assets[asset].point
+    at = baseline if point is None else baseline.at(point)
+    name = f"{asset}-{datetime.fromtimestamp(blocks[0].t[0], UTC):%Y%m%dT%H%M%S}.parquet"
+    return blocks_to_recording(at, name, blocks)[0]
+
+
+def write_stretch(folder: Path, stretch: Recording) -> Path:
+    """Write samples from the store into a folder, as history and jobs read them; return the file."""
+    path = folder / stretch.name
+    write_recording(path, stretch, Columns(covariates={name: name for name in stretch.channels}))
+    return path
+
+
+def read_stretch(path: Path, baseline: Baseline) -> Recording:
+    """Read what `write_stretch` wrote of an asset with this baseline."""
+    return readers.read(
+        path, baseline.loop, columns=Columns(covariates={name: name for name in baseline.loop.columns.covariates})
+    )
+
+
+def judge_again(store: Store, asset: str, before: Baseline, after: Baseline, now: float) -> PastVerdicts:
+    """Judge the stored coefficients of the last weeks by two baselines.
+
+    A coefficient's own deviation, squared and over its variance, is at most T^2: what exceeds the limit so is certainly
+    beyond it. Its expectation by the new baseline is that by the old one, moved as the healthy coefficient has.
+    """
+    series = read_series(store, asset, (now - JUDGED_AGAIN_S, None), ("coefficient",))
+    exceeded: dict[float, list[bool]] = {}
+    shift = np.array(after.theta) - np.array(before.theta)
+    variances = [np.diag(each.covariance_array()) for each in (before, after)]
+    for i, name in enumerate(before.names):
+        for t, value, low, high, healthy in series.get(("coefficient", name), np.zeros((5, 0))).T:
+            own = ((high - low) / (2.0 * NORMAL_95)) ** 2
+            offs = value - healthy, value - healthy - shift[i]
+            limits = before.thresholds.statistic, after.thresholds.statistic
+            beyond = [off**2 > limit * (own + C[i]) for off, limit, C in zip(offs, limits, variances, strict=True)]
+            exceeded[t] = [a or b for a, b in zip(exceeded.get(t, (False, False)), beyond, strict=True)]
+    counts = np.array(list(exceeded.values()), dtype=int).reshape(-1, 2).sum(axis=0)
+    return PastVerdicts(len(exceeded), *counts.tolist())
+
+
+def put_in_force(
+    config: ServiceFile, store: Store, asset: str, baseline: Baseline, stretch: Recording, t: float
+) -> Path:
+    """Put a relearned baseline in force from `t` [UTC s] on, and return its file; the service takes it soon.
+
+    The file is the asset's own; the service file's baseline stays as it is. The samples are kept with the history.
+
+    Raises BaselineError if another one was put in force since its preview, OutputError if a file cannot be written.
+    """
+    own, present = config.relearned_file(asset), Baseline.load(config.baseline_file(asset))
+    if present.revision.number != baseline.revision.parent:
+        raise BaselineError(f"{asset}: another baseline was put in force meanwhile, look at a new preview")
+    make_folder(history_folder(own))
+    write_stretch(history_folder(own), stretch)
+    if not own.exists():
+        present.save(own)
+    replace_baseline(own, baseline)
+    _announce(store, asset, baseline, t)
+    return own
+
+
+def go_back(config: ServiceFile, store: Store, asset: str, who: str, why: str, t: float) -> Baseline:
+    """Put the earlier baseline of an asset in force again from `t` [UTC s] on; raises BaselineError without one."""
+    own = config.relearned_file(asset)
+    if not own.exists():
+        raise BaselineError(f"{asset}: its baseline was never relearned, there is none to go back to")
+    restored = step_back(own, who, why)
+    _announce(store, asset, restored, t)
+    return restored
+
+
+def _announce(store: Store, asset: str, baseline: Baseline, t: float) -> None:
+    """Note what was put in force, for curves and audit, and let the service take it."""
+    revision = baseline.revision
+    text = f"baseline {revision.number} ({revision.kind}){': ' if revision.why else ''}{revision.why}"[:200]
+    document = {"t": t, "text": text, "anew": revision.kind in (*RENEWALS, "back"), "kind": BASELINE_NOTE}
+    store.add_audit(revision.who, asset, NOTE, document)
+    store.add_command(revision.who, asset, "", RELEARN, reason=revision.why)

@@ -1,0 +1,88 @@
+"""An asset's baseline after a repair or a healthy stretch: how far it is, a preview, what is put in force, and back."""
+
+from __future__ import annotations
+
+import asyncio
+from functools import partial
+
+from fastapi import APIRouter
+from starlette.exceptions import HTTPException
+from starlette.status import HTTP_202_ACCEPTED
+
+from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.history import history_folder
+from servoscope.service import relearning
+from servoscope.service.config import ServiceFile
+from servoscope.web.dependencies import VIEWER, Context, ContextDep, Engineer
+from servoscope.web.jobs.queue import Job
+from servoscope.web.routes.assets import find_asset
+from servoscope.web.schemas import responses
+from servoscope.web.schemas.requests import RelearningRequest, TakeRequest
+
+router = APIRouter(tags=["assets"], dependencies=[VIEWER])
+
+
+def _find_config(context: Context, asset: str) -> ServiceFile:
+    find_asset(context, asset)
+    if context.config is None or asset not in context.config.assets:
+        raise HTTPException(404, f"no service file is known that has an asset {asset}")
+    return context.config
+
+
+@router.get("/assets/{asset}/relearning")
+def get_progress(context: ContextDep, asset: str) -> responses.RelearningState | None:
+    """Return how far it is in learning after what was noted; null where no service file is known."""
+    (_, status), config = find_asset(context, asset), context.config
+    if config is None or asset not in config.assets:
+        return None
+    progress = relearning.learning_progress(config, context.store, asset, status)
+    return responses.RelearningState(**progress._asdict())
+
+
+@router.post("/assets/{asset}/relearnings", status_code=HTTP_202_ACCEPTED)
+async def start_preview(
+    context: ContextDep, who: Engineer, asset: str, request: RelearningRequest
+) -> responses.JobResponse:
+    """Learn its baseline anew from the samples that the store keeps; a job. Nothing is put in force."""
+    config = await asyncio.to_thread(_find_config, context, asset)
+    stretch = await asyncio.to_thread(
+        relearning.stored_stretch, config, context.store, asset, request.since, request.until
+    )
+    path, point = config.baseline_file(asset), config.assets[asset].point or ""
+    before = await asyncio.to_thread(Baseline.load, path)
+    id_, out = await asyncio.to_thread(context.storage.create, "learnings")
+    file = await asyncio.to_thread(relearning.write_stretch, out, stretch)
+
+    def finish(result: responses.JsonObject) -> responses.JsonObject:
+        learned = Baseline.load(out / "baseline.json")
+        judged = relearning.judge_again(context.store, asset, before, learned, find_asset(context, asset)[1].position.t)
+        context.storage.publish(responses.LearningRow(id=id_, who=who.user, uploads=[asset, file.name]))
+        return {"learning": id_, "judged": judged._asdict(), **result}
+
+    sources = [path.parent / source.name for each in before.per_point for source in each.sources]
+    reads = [str(one) for one in (path, history_folder(path), *sources) if one.exists()]
+    arguments = str(path), str(file), request, point, who.user, str(out)
+    discard = partial(context.storage.remove, "learnings", id_)
+    return context.jobs.submit(
+        Job("relearning", who.user, "relearn_baseline", arguments, out, reads, out, finish, discard)
+    )
+
+
+@router.post("/assets/{asset}/baseline")
+def put_in_force(
+    context: ContextDep, who: Engineer, asset: str, request: TakeRequest
+) -> responses.RelearningState | None:
+    """Put the baseline of a preview in force, or go one step back; the earlier one is kept."""
+    config = _find_config(context, asset)
+    _, status = find_asset(context, asset)
+    if request.learning is None:
+        relearning.go_back(config, context.store, asset, who.user, request.why, status.position.t)
+        return get_progress(context, asset)
+    record = context.storage.read(responses.LearningRow, request.learning)
+    if record.uploads[:1] != [asset]:
+        raise HTTPException(404, f"there is no preview {request.learning} of {asset}")
+    folder = context.storage.path(responses.LearningRow, request.learning)
+    learned = Baseline.load(folder / "baseline.json")
+    stretch = relearning.read_stretch(folder / record.uploads[1], learned)
+    relearning.put_in_force(config, context.store, asset, learned, stretch, status.position.t)
+    return get_progress(context, asset)
