@@ -24,6 +24,7 @@ from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.learning.inspection import inspect
 from servoscope.models import plants
 from servoscope.models.plants import axis
+from servoscope.report.document import DETAILS
 from servoscope.report.inspection_page import render_inspection_page
 
 OPEN, CLOSE = "\N{MATHEMATICAL LEFT WHITE SQUARE BRACKET}", "\N{MATHEMATICAL RIGHT WHITE SQUARE BRACKET}"
@@ -113,7 +114,7 @@ def test_no_sentence_is_left_outside_of_the_catalogue(monkeypatch: pytest.Monkey
     for name in ("healthy", "suspect"):
         recording = ss.read(FOLDER / f"{name}.parquet", baseline.loop)
         diagnosis, trace = diagnose_with_trace(baseline, recording)
-        print_diagnosis(console, diagnosis, details=True)
+        print_diagnosis(console, diagnosis, DETAILS)
         pages.append(report.render_diagnosis_page(diagnosis, trace, recording, baseline.loop, {}))
         inspection = inspect(recording, baseline.loop)
         results.print_inspection(console, inspection)
