@@ -152,7 +152,8 @@ def test_an_asset_in_detail(client: httpx.Client) -> None:
     assert np.all(np.diff(signals["t"]) > 0.0)
     end = signals["t"][-1] - 2.0  # a part of them, every sample
     part = client.get("/assets/press/signals", params={"seconds": 1, "to": end, "points": 1000}).json()
-    assert part["samples"] == 100 and end - 1.0 < part["t"][0] <= part["t"][-1] <= end
+    # a stamp of today has steps of 0.2 us: a sample on the edge may be on either side of it
+    assert abs(part["samples"] - 100) <= 1 and end - 1.0 < part["t"][0] <= part["t"][-1] <= end
     full = client.get("/diagnoses", params={"asset": "press", "grounds": "full"}).json()["diagnoses"][-1]
     *_, now = client.get(f"/diagnoses/{full['id']}").json()["signature"]
     assert now["words"] in ("after", "measured") and len(now["position"]) == len(now["forward"]) > 20
