@@ -104,7 +104,7 @@ def test_friction_is_never_a_reason_to_refuse() -> None:
     late = loop.model_copy(update={"delay": 2.0 / loop.sample_rate})
     recording, _ = simulate(late, smooth.motion("moves", 30.0, loop.sample_rate, 1), noise_y_std=1e-4, seed=1)
     delay_s, notes = check_delay(loop, [recording])
-    assert delay_s is None and all("cannot" in str(note) or "do not tell" in str(note) for note in notes)
+    assert delay_s is None and all("cannot" in str(note) or "do not determine" in str(note) for note in notes)
 
 
 def test_a_slower_plant_is_no_delay() -> None:

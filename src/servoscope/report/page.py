@@ -41,7 +41,6 @@ FILTERS = {
     "probability": format_values.format_probability,
     "split_symbols": lambda text: format_values.split_symbols(str(text)),
     "symbol_parts": format_values.symbol_parts,
-    "word": translate,
     "word_range": lambda cell: type(cell)(translate_range(cell)) if isinstance(cell, str) else cell,  # Markup stays so
 }
 
@@ -123,7 +122,13 @@ def say(key: str, **values: Any) -> str:
 
 @functools.cache
 def _environment(package: str) -> Environment:
-    from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined  # late: commands start without it
+    from jinja2 import (  # late: commands start without it
+        ChoiceLoader,
+        Environment,
+        PackageLoader,
+        StrictUndefined,
+        pass_context,
+    )
 
     loaders = [PackageLoader(name) for name in dict.fromkeys((package, "servoscope.report"))]
     environment = Environment(
@@ -132,9 +137,10 @@ def _environment(package: str) -> Environment:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        optimized=False,  # else words are translated once, into the language of the first page
     )
     environment.filters |= FILTERS
+    # with a context: else constant words are translated once, into the language of the first page
+    environment.filters["word"] = pass_context(lambda _, words: translate(words))
     folder = files("servoscope.report")
     environment.globals["style"] = "".join(
         folder.joinpath(name).read_text(encoding="utf-8") for name in ("palette.css", "report.css")
