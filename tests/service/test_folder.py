@@ -134,7 +134,7 @@ def test_a_file_that_cannot_be_read_is_set_aside_and_the_next_good_one_ends_the_
     source = press.open()
     press.until_rows(50, "lift")
     press.until(lambda: press.rejections["unreadable"])
-    assert (press.reasons[0].asset == "press" and "'twenty'" not in press.reasons[0].reason) or True
+    assert press.reasons[0].asset == "press"
     trouble = source.asset_troubles["press"]
     assert trouble.state == "refused" and "press_1.csv" in trouble.why
     assert "lift" not in source.asset_troubles

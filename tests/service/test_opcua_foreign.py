@@ -75,10 +75,10 @@ def test_what_comes_too_slowly_is_told_and_makes_no_samples(plant: ForeignPlant)
     until(lambda: (blocks.extend(source.poll(100)), len(blocks) > 3)[1], 60.0)
     assert source.connected and not source.trouble
     assert {block.asset for block in blocks} == {"lift"}  # one slow and one mistyped asset cost no other
-    state, why = source.asset_troubles["press"]
-    assert state == "slow" and "u comes every 50 ms, the loop needs 10" in why
-    state, why = source.asset_troubles["wrong"]
-    assert state == "refused" and "ns=1;s=lift.z (BadNodeIdUnknown)" in why
+    press = source.asset_troubles["press"]
+    assert press.state == "slow" and "u comes every 50 ms, the loop needs 10" in press.why
+    wrong = source.asset_troubles["wrong"]
+    assert wrong.state == "refused" and "ns=1;s=lift.z (BadNodeIdUnknown)" in wrong.why
     until(lambda: ("lift", "u") in source.update_intervals_s, 60.0)
     assert source.update_intervals_s["lift", "u"] == pytest.approx(1.0 / RATE, rel=0.3)
     y = np.concatenate([block.y for block in blocks])
