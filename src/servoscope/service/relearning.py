@@ -11,7 +11,7 @@ import numpy as np
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.history import history_folder, replace_baseline, step_back
 from servoscope.baseline.records import RENEWALS, Occasion
-from servoscope.core.errors import BaselineError, StoreError
+from servoscope.core.errors import BaselineError, RecordingError
 from servoscope.core.files import make_folder
 from servoscope.models.loop import Columns
 from servoscope.prognosis.series import NORMAL_95
@@ -66,13 +66,13 @@ def stored_stretch(
 ) -> Recording:
     """Return the samples of an asset that the store keeps of a time [UTC s], under the name that its file is to have.
 
-    Raises StoreError if there are none, RecordingError if they cannot be used.
+    Raises RecordingError if there are none, or if they cannot be used.
     """
     blocks = [Block.unpack(asset, *row) for row in store.recent_samples(asset)]
     first, last = since if since is not None else -np.inf, until if until is not None else np.inf
     blocks = [block for block in blocks if block.t[0] >= first and block.t[-1] < last]
     if not blocks:
-        raise StoreError(f"{asset}: the store keeps no samples of that time, see [diagnosis] keep_s")
+        raise RecordingError(f"{asset}: the store keeps no samples of that time, see [diagnosis] keep_s")
     baseline, point = Baseline.load(config.baseline_file(asset)), config.assets[asset].point
     at = baseline if point is None else baseline.at(point)
     name = f"{asset}-{datetime.fromtimestamp(blocks[0].t[0], UTC):%Y%m%dT%H%M%S}.parquet"
