@@ -50,9 +50,9 @@ def relearn(
     if back:
         print_difference(before, relearning.go_back(settings, store, asset, who, why, t), as_json)
         return
-    noted = relearning.learning_progress(settings, store, asset, status)
+    noted = relearning.learning_progress(settings, store, asset, status, before)
     begin = parse_time(since, "--since") if since is not None else noted.since
-    stretch = relearning.stored_stretch(settings, store, asset, begin, parse_time(until, "--to"))
+    stretch = relearning.stored_stretch(settings, store, asset, before, begin, parse_time(until, "--to"))
     with show_steps(1, 8) as steps:
         steps.begin(stretch.name)
         learned = learn_anew(

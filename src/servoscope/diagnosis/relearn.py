@@ -13,10 +13,10 @@ from servoscope.core.errors import BaselineError
 from servoscope.core.messages import Message, message
 from servoscope.diagnosis.operating_points import compare_with_earlier, learn
 from servoscope.learning.learn import Progress
-from servoscope.models.loop import Columns
 from servoscope.signals import Recording, readers
 from servoscope.signals.readers import as_recording
 from servoscope.signals.readers.frames import Source
+from servoscope.signals.writers import plain_columns
 
 
 def relearn(
@@ -140,7 +140,7 @@ def find_sources(baseline: Baseline, folders: Sequence[Path]) -> tuple[list[Reco
     A file of another number of samples is another recording. Samples that a service kept have their own columns.
     """
     loop, recordings, missing = baseline.loop, list[Recording](), list[str]()
-    own = Columns(covariates={name: name for name in loop.columns.covariates})
+    own = plain_columns(loop.columns.covariates)
     for source in baseline.sources:
         files = [folder / source.name for folder in folders if (folder / source.name).is_file()]
         for file in files:

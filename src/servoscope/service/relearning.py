@@ -13,7 +13,6 @@ from servoscope.baseline.history import history_folder, replace_baseline, step_b
 from servoscope.baseline.records import RENEWALS, Occasion
 from servoscope.core.errors import BaselineError, RecordingError
 from servoscope.core.files import make_folder
-from servoscope.models.loop import Columns
 from servoscope.prognosis.series import NORMAL_95
 from servoscope.service.assets.examination import blocks_to_recording
 from servoscope.service.assets.status import AssetStatus
@@ -23,7 +22,7 @@ from servoscope.service.store import Store
 from servoscope.service.store.rows import NOTE, RELEARN
 from servoscope.service.store.series import read_notes, read_series
 from servoscope.signals import Recording, readers
-from servoscope.signals.writers import write_recording
+from servoscope.signals.writers import plain_columns, write_recording
 
 MIN_LEARN_S = 600.0  # length of a stretch that is enough to learn from [s], unless fewer samples are kept
 JUDGED_AGAIN_S = 28 * 86400.0  # of past values that a preview judges again [s]
@@ -49,9 +48,11 @@ class PastVerdicts(NamedTuple):
     after: int
 
 
-def learning_progress(config: ServiceFile, store: Store, asset: str, status: AssetStatus) -> LearningProgress:
-    """Return how far the learning of an asset is; raises BaselineError if its baseline cannot be read."""
-    revision = Baseline.load(config.baseline_file(asset)).revision
+def learning_progress(
+    config: ServiceFile, store: Store, asset: str, status: AssetStatus, baseline: Baseline
+) -> LearningProgress:
+    """Return how far the learning of an asset is; `baseline`: the one in force."""
+    revision = baseline.revision
     notes = [note for note in read_notes(store, asset) if note.get("kind", NOTE) != NOTE]
     kept_s = config.diagnosis.kept_s
     known = min(MIN_LEARN_S, kept_s), revision.number, revision.parent > 0
@@ -62,18 +63,18 @@ def learning_progress(config: ServiceFile, store: Store, asset: str, status: Ass
 
 
 def stored_stretch(
-    config: ServiceFile, store: Store, asset: str, since: float | None, until: float | None = None
+    config: ServiceFile, store: Store, asset: str, baseline: Baseline, since: float | None, until: float | None = None
 ) -> Recording:
     """Return the samples of an asset that the store keeps of a time [UTC s], under the name that its file is to have.
 
-    Raises RecordingError if there are none, or if they cannot be used.
+    `baseline`: the one in force. Raises RecordingError if there are none, or if they cannot be used.
     """
     blocks = [Block.unpack(asset, *row) for row in store.recent_samples(asset)]
     first, last = since if since is not None else -np.inf, until if until is not None else np.inf
     blocks = [block for block in blocks if block.t[0] >= first and block.t[-1] < last]
     if not blocks:
         raise RecordingError(f"{asset}: the store keeps no samples of that time, see [diagnosis] keep_s")
-    baseline, point = Baseline.load(config.baseline_file(asset)), config.assets[asset].point
+    point = config.assets[asset].point
     at = baseline if point is None else baseline.at(point)
     name = f"{asset}-{datetime.fromtimestamp(blocks[0].t[0], UTC):%Y%m%dT%H%M%S}.parquet"
     return blocks_to_recording(at, name, blocks)[0]
@@ -82,15 +83,13 @@ def stored_stretch(
 def write_stretch(folder: Path, stretch: Recording) -> Path:
     """Write samples from the store into a folder, as history and jobs read them; return the file."""
     path = folder / stretch.name
-    write_recording(path, stretch, Columns(covariates={name: name for name in stretch.channels}))
+    write_recording(path, stretch, plain_columns(stretch.channels))
     return path
 
 
 def read_stretch(path: Path, baseline: Baseline) -> Recording:
     """Read what `write_stretch` wrote of an asset with this baseline."""
-    return readers.read(
-        path, baseline.loop, columns=Columns(covariates={name: name for name in baseline.loop.columns.covariates})
-    )
+    return readers.read(path, baseline.loop, columns=plain_columns(baseline.loop.columns.covariates))
 
 
 def judge_again(store: Store, asset: str, before: Baseline, after: Baseline, now: float) -> PastVerdicts:

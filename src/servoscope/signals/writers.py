@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,11 @@ from servoscope.signals import Recording
 from servoscope.signals.readers.table import TIME_UNITS, is_number
 
 SUFFIXES = (".csv", ".parquet", ".pq")
+
+
+def plain_columns(covariates: Iterable[str]) -> Columns:
+    """Return the columns of samples that a service kept: covariates stand under their own names."""
+    return Columns(covariates={name: name for name in covariates})
 
 
 def write_recording(path: str | Path, recording: Recording, columns: Columns | None = None) -> Columns:

@@ -1,6 +1,6 @@
 // What an operator can do about an alarm: buttons for what means something now, and questions where an answer is needed.
 import { mayChange, part, post } from "./api.js";
-import { complaint, field, h } from "./dom.js";
+import { ask, field, h } from "./dom.js";
 
 const WORDS = {
   acknowledge: "Acknowledge",
@@ -52,38 +52,10 @@ export function commands(alarm, session, said) {
   return h("div", { class: "actions" }, made);
 }
 
-// A dialog that stays until the command was taken, or is given up.
 function question(alarm, command, send) {
-  return new Promise((resolve) => {
-    const why = h("input", { name: "why", maxlength: "200" });
-    const long = h("select", { name: "for" }, Object.entries(HOURS).map(([words, seconds]) => h("option", { value: seconds, selected: words === "8 h" }, words)));
-    const failed = h("div", {});
-    const dialog = h("dialog", { "aria-labelledby": "asked" });
-    const submit = async (event) => {
-      event.preventDefault();
-      try {
-        await send(command, { why: why.value, ...(command === "shelve" ? { for_s: Number(long.value) } : {}) });
-        dialog.close();
-      } catch (error) {
-        failed.replaceChildren(complaint(error));
-      }
-    };
-    dialog.append(
-      h(
-        "form",
-        { onsubmit: submit },
-        h("h2", { id: "asked" }, `${WORDS[command]}: ${alarm.alarm} of ${alarm.asset}`),
-        h("p", { class: "note" }, NEEDS[command]),
-        h("div", { class: "fields" }, command === "shelve" && field("For", long), field("Why", why)),
-        failed,
-        h("div", { class: "actions" }, h("button", { class: "first" }, WORDS[command]), h("button", { type: "button", onclick: () => dialog.close() }, "Cancel")),
-      ),
-    );
-    dialog.addEventListener("close", () => {
-      dialog.remove();
-      resolve();
-    });
-    document.body.append(dialog);
-    dialog.showModal();
-  });
+  const why = h("input", { name: "why", maxlength: "200" });
+  const long = h("select", { name: "for" }, Object.entries(HOURS).map(([words, seconds]) => h("option", { value: seconds, selected: words === "8 h" }, words)));
+  const fields = [command === "shelve" && field("For", long), field("Why", why)];
+  const taken = () => send(command, { why: why.value, ...(command === "shelve" ? { for_s: Number(long.value) } : {}) });
+  return ask(`${WORDS[command]}: ${alarm.alarm} of ${alarm.asset}`, WORDS[command], fields, taken, NEEDS[command]);
 }

@@ -84,6 +84,28 @@ export function complaint(error) {
   return h("p", { class: "complaint", role: "alert" }, error.message ?? String(error));
 }
 
+// Ask in a dialog, which stays until `send` has taken what its fields hold, or is given up; resolves when it is closed.
+export function ask(title, words, fields, send, note = null) {
+  return new Promise((resolve) => {
+    const failed = h("div", {});
+    const submit = async (event) => {
+      event.preventDefault();
+      try {
+        await send();
+        dialog.close();
+      } catch (error) {
+        failed.replaceChildren(complaint(error));
+      }
+    };
+    const actions = h("div", { class: "actions" }, h("button", { class: "first" }, words), h("button", { type: "button", onclick: () => dialog.close() }, "Cancel"));
+    const form = h("form", { onsubmit: submit }, h("h2", { id: "asked" }, title), note && h("p", { class: "note" }, note), h("div", { class: "fields" }, fields), failed, actions);
+    const dialog = h("dialog", { "aria-labelledby": "asked" }, form);
+    dialog.addEventListener("close", () => (dialog.remove(), resolve()));
+    document.body.append(dialog);
+    dialog.showModal();
+  });
+}
+
 // Does what a button asks for: its steps are told, what goes wrong is said, and at the end it can be pressed again.
 export async function during(button, said, work, settle = () => (button.disabled = false)) {
   button.disabled = true;

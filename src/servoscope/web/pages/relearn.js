@@ -1,6 +1,6 @@
 // What the asset is compared with: noted repairs, how far it has learned since, a preview of the next baseline, and one step back.
 import { get, job, mayChange, post } from "./api.js";
-import { complaint, during, field, h, section, table, tell } from "./dom.js";
+import { ask, during, field, h, section, table, tell } from "./dom.js";
 import { DASH, change, moment, number, plain } from "./words.js";
 
 const OCCASIONS = { repair: "a repair", tool: "another tool", product: "another product", season: "another season" };
@@ -17,7 +17,7 @@ export function relearning(path, session, asset, signal) {
 
   async function load() {
     state = await get(`${path}/relearning`, signal);
-    if (!state) return; // no service file is known
+    if (!state) return clearInterval(timer); // no service file is known
     element.hidden = false;
     back.hidden = !state.can_go_back;
     const minutes = (seconds) => number(seconds / 60, 2);
@@ -25,32 +25,15 @@ export function relearning(path, session, asset, signal) {
     const learning = state.after && (enough ? `Learned enough after ${state.after}: look at the new baseline.` : `Learning after ${state.after}: ${minutes(state.learned_s)} of ${minutes(state.needed_s)} min.`);
     tell(said, learning || `Baseline ${state.revision} is in force.`);
     healthy.classList.toggle("first", Boolean(state.after) && enough);
-    if (!signal.aborted) setTimeout(() => load().catch(() => {}), EVERY_MS);
   }
 
-  // A dialog with fields; `send` is called with what they hold.
-  function dialog(title, words, fields, send) {
-    const failed = h("div", {});
-    const submit = async (event) => {
-      event.preventDefault();
-      try {
-        await send();
-        shell.close();
-      } catch (error) {
-        failed.replaceChildren(complaint(error));
-      }
-    };
-    const actions = h("div", { class: "actions" }, h("button", { class: "first" }, words), h("button", { type: "button", onclick: () => shell.close() }, "Cancel"));
-    const shell = h("dialog", { "aria-labelledby": "relearned" }, h("form", { onsubmit: submit }, h("h2", { id: "relearned" }, title), h("div", { class: "fields" }, fields), failed, actions));
-    shell.addEventListener("close", () => shell.remove());
-    document.body.append(shell);
-    shell.showModal();
-  }
+  const timer = setInterval(() => load().catch(() => {}), EVERY_MS);
+  signal.addEventListener("abort", () => clearInterval(timer));
 
   function repair() {
     const kind = h("select", {}, Object.entries(OCCASIONS).map(([value, words]) => h("option", { value }, words)));
     const text = h("input", { maxlength: "200" });
-    dialog("What was done", "Learn again", [field("After", kind), field("What was done", text)], async () => {
+    ask("What was done", "Learn again", [field("After", kind), field("What was done", text)], async () => {
       await post(`${path}/notes`, { t: asset().t, text: text.value || kind.value, anew: kind.value !== "season", kind: kind.value }, signal);
       await load();
     });
@@ -59,7 +42,7 @@ export function relearning(path, session, asset, signal) {
   function stretch() {
     const since = h("select", {}, state.since && h("option", { value: state.since }, `since ${moment(state.since, { seconds: false })}`), [600, 3600].map((seconds) => h("option", { value: asset().t - seconds }, `the last ${seconds / 60} min`)), h("option", { value: "" }, "all that is kept"));
     const why = h("input", { maxlength: "200" });
-    dialog("Learn from samples", "Preview", [field("Samples", since), field("Why", why)], async () => {
+    ask("Learn from samples", "Preview", [field("Samples", since), field("Why", why)], async () => {
       const body = { from: since.value ? Number(since.value) : null, after: state.after, why: why.value };
       during(healthy, answer, async (step) => show(await job(`${path}/relearnings`, body, { signal, step })));
     });
@@ -87,7 +70,7 @@ export function relearning(path, session, asset, signal) {
 
   function undo() {
     const why = h("input", { maxlength: "200" });
-    dialog("One step back", "Go back", [field("Why", why)], async () => {
+    ask("One step back", "Go back", [field("Why", why)], async () => {
       await post(`${path}/baseline`, { why: why.value }, signal);
       await load();
     });

@@ -12,21 +12,29 @@ from starlette.status import HTTP_202_ACCEPTED
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.history import history_folder
 from servoscope.service import relearning
+from servoscope.service.assets.status import AssetStatus
 from servoscope.service.config import ServiceFile
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Engineer
 from servoscope.web.jobs.queue import Job
 from servoscope.web.routes.assets import find_asset
+from servoscope.web.routes.baselines import load_cached
 from servoscope.web.schemas import responses
 from servoscope.web.schemas.requests import RelearningRequest, TakeRequest
 
 router = APIRouter(tags=["assets"], dependencies=[VIEWER])
 
 
-def _find_config(context: Context, asset: str) -> ServiceFile:
-    find_asset(context, asset)
+def _find_config(context: Context, asset: str) -> tuple[ServiceFile, AssetStatus]:
+    _, status = find_asset(context, asset)
     if context.config is None or asset not in context.config.assets:
         raise HTTPException(404, f"no service file is known that has an asset {asset}")
-    return context.config
+    return context.config, status
+
+
+def _progress(context: Context, config: ServiceFile, asset: str, status: AssetStatus) -> responses.RelearningState:
+    baseline = load_cached(config.baseline_file(asset))
+    progress = relearning.learning_progress(config, context.store, asset, status, baseline)
+    return responses.RelearningState(**progress._asdict())
 
 
 @router.get("/assets/{asset}/relearning")
@@ -35,8 +43,7 @@ def get_progress(context: ContextDep, asset: str) -> responses.RelearningState |
     (_, status), config = find_asset(context, asset), context.config
     if config is None or asset not in config.assets:
         return None
-    progress = relearning.learning_progress(config, context.store, asset, status)
-    return responses.RelearningState(**progress._asdict())
+    return _progress(context, config, asset, status)
 
 
 @router.post("/assets/{asset}/relearnings", status_code=HTTP_202_ACCEPTED)
@@ -44,12 +51,12 @@ async def start_preview(
     context: ContextDep, who: Engineer, asset: str, request: RelearningRequest
 ) -> responses.JobResponse:
     """Learn its baseline anew from the samples that the store keeps; a job. Nothing is put in force."""
-    config = await asyncio.to_thread(_find_config, context, asset)
-    stretch = await asyncio.to_thread(
-        relearning.stored_stretch, config, context.store, asset, request.since, request.until
-    )
+    config, _ = await asyncio.to_thread(_find_config, context, asset)
     path, point = config.baseline_file(asset), config.assets[asset].point or ""
-    before = await asyncio.to_thread(Baseline.load, path)
+    before = await asyncio.to_thread(load_cached, path)
+    stretch = await asyncio.to_thread(
+        relearning.stored_stretch, config, context.store, asset, before, request.since, request.until
+    )
     id_, out = await asyncio.to_thread(context.storage.create, "learnings")
     file = await asyncio.to_thread(relearning.write_stretch, out, stretch)
 
@@ -69,15 +76,12 @@ async def start_preview(
 
 
 @router.post("/assets/{asset}/baseline")
-def put_in_force(
-    context: ContextDep, who: Engineer, asset: str, request: TakeRequest
-) -> responses.RelearningState | None:
+def put_in_force(context: ContextDep, who: Engineer, asset: str, request: TakeRequest) -> responses.RelearningState:
     """Put the baseline of a preview in force, or go one step back; the earlier one is kept."""
-    config = _find_config(context, asset)
-    _, status = find_asset(context, asset)
+    config, status = _find_config(context, asset)
     if request.learning is None:
         relearning.go_back(config, context.store, asset, who.user, request.why, status.position.t)
-        return get_progress(context, asset)
+        return _progress(context, config, asset, status)
     record = context.storage.read(responses.LearningRow, request.learning)
     if record.uploads[:1] != [asset]:
         raise HTTPException(404, f"there is no preview {request.learning} of {asset}")
@@ -85,4 +89,4 @@ def put_in_force(
     learned = Baseline.load(folder / "baseline.json")
     stretch = relearning.read_stretch(folder / record.uploads[1], learned)
     relearning.put_in_force(config, context.store, asset, learned, stretch, status.position.t)
-    return get_progress(context, asset)
+    return _progress(context, config, asset, status)
