@@ -22,6 +22,7 @@ from servoscope.service.actions import ActionSettings, OutboxEntry, deliver, dia
 from servoscope.service.actions import mail as mail_module
 from servoscope.service.actions.dispatcher import OutboxDispatcher
 from servoscope.service.alarms import AlarmTransition, LifecycleEvent, LifecycleState, initial_alarm_state
+from servoscope.service.asset_link import qr_code
 from servoscope.service.clock import SteadyClock
 from servoscope.service.store import Batch, Store
 
@@ -75,7 +76,7 @@ def entry(settings: ActionSettings, transition: AlarmTransition = NEW) -> Outbox
 
 
 @pytest.mark.parametrize("encryption", ["starttls", "tls"])
-def test_a_mail_is_plain_text_with_a_link_over_an_encrypted_connection(
+def test_a_mail_is_plain_text_with_a_link_and_its_qr_code_over_an_encrypted_connection(
     encryption: str, serve: Callable[[str], tuple[MailServer, dict[str, Any]]]
 ) -> None:
     inbox, keys = serve(encryption)
@@ -86,8 +87,11 @@ def test_a_mail_is_plain_text_with_a_link_over_an_encrypted_connection(
     (mail,) = inbox.mails
     assert mail["Subject"] == "[servoscope] press 1: fault, high, unacknowledged"
     assert mail["From"] == MAIL["sender"] and mail["To"] == "shift@plant.example, chief@plant.example"
-    assert mail["Message-ID"] == f"<{row.key}@servoscope>" and mail.get_content_type() == "text/plain"
-    assert mail.get_content().splitlines() == [
+    assert mail["Message-ID"] == f"<{row.key}@servoscope>"
+    (code,) = mail.iter_attachments()
+    assert code.get_content() == qr_code("https://hall.example/assets/press%201", "png")
+    body = mail.get_body(("plain",))
+    assert body is not None and body.get_content().splitlines() == [
         "press 1: fault, high, unacknowledged",
         "leakage \u00fc",
         "look at the seal",

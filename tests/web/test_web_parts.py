@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+import screens
 from starlette.datastructures import Headers
 
 from servoscope.core.sandbox import Sandbox
@@ -100,3 +102,32 @@ def test_columns_are_guessed_by_their_names(names: list[str], found: tuple[str |
 )
 def test_the_language_is_the_readers_choice_or_the_browsers(cookie: str, asked: str, language: str) -> None:
     assert request_language(Headers({"cookie": cookie, "accept-language": asked})) == language
+
+
+PAGES = Path(screens.SOURCES) / "servoscope" / "web" / "pages"
+
+
+def test_help_leads_to_headings_of_the_documentation(project: Path) -> None:
+    source = (PAGES / "help.js").read_text(encoding="utf-8")
+    topics = re.findall(r'^  "([a-z/#0-9-]+)": \[', source, re.M)
+    assert len(topics) > 10
+    for page, _, part in (topic.partition("#") for topic in topics):
+        text = (project / "docs" / f"{page}.md").read_text(encoding="utf-8")
+        headings = [
+            re.sub(r"[^\w -]", "", each.lower()).replace(" ", "-") for each in re.findall("^#+ (.+)", text, re.M)
+        ]
+        assert not part or part in headings, (page, part)
+    titled = {
+        title for path in PAGES.glob("*.js") for title in re.findall(r'(?:section|titled)\("([^"]+)"', path.read_text())
+    }
+    assert len(titled) > 20 and [title for title in titled if f'"{title}"' not in source] == []
+
+
+def test_pages_explain_words_as_the_glossary_does(project: Path) -> None:
+    source = (PAGES / "help.js").read_text(encoding="utf-8").partition("const GLOSSARY")[2].partition("};")[0]
+    explained = re.findall(r'^  (?:"([^"]+)"|(\w+)): "(.*)",$', source, re.M)
+    rows = re.findall(
+        r"^\| ([^|]+) \| ([^|]+) \|", (project / "docs" / "glossary.md").read_text(encoding="utf-8"), re.M
+    )
+    known = {term: means for terms, means in rows for term in terms.split(", ")}
+    assert len(explained) == 10 and [one for one in explained if known.get(one[0] or one[1]) != one[2]] == []

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import screens
-from opening import PATIENCE_MS, accessible
+from opening import LONG_MS, PATIENCE_MS, accessible
 from screens import asked, until
 
 from servoscope.core.messages import message
@@ -192,6 +192,8 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         batch.rows["transitions"].append(row | {"cause": "", "who": who, "document": {"event": event}})
     store.write(batch, "hall", 1)
     store.add_audit("otto", "step", "note", {"t": NOW - 3000.0, "text": "seal replaced", "anew": True})
+    document = {"t": NOW - 1000.0, "text": "baseline 2 (repair)", "anew": True, "kind": "baseline"}
+    store.add_audit("otto", "step", "note", document)
     store.close()
     base = f"http://127.0.0.1:{screens.free_port()}"
     with screens.process("serve", "--store", "history.sqlite", "--listen", base.removeprefix("http://"), cwd=folder):
@@ -239,8 +241,9 @@ def test_a_timeline_shows_what_has_happened(page: Any, address: str, tmp_path: P
     assert rows == [
         ("Fault", 5000.0, 3000.0),
         ("Answers", 4000.0, None),
-        ("Notes", 3000.0, None),
+        ("Repairs", 3000.0, None),
         ("Data", 2500.0, 2000.0),
+        ("Baselines", 1000.0, None),
         ("Fault", 480.0, 0.0),  # from its onset on, and until now
         ("Diagnoses", 0.0, None),
     ]
@@ -305,3 +308,24 @@ def test_a_phone_shows_machines_first(page: Any, address: str) -> None:
     playwright.expect(titles.filter(visible=True)).to_have_text(
         ["State", "Asset", "What is known", "Lasting", "Distance / limit", "Data", "Alarms", "Sample"]
     )  # no group, no limit, no growth
+
+
+def test_a_section_opens_its_documentation_and_words_explain_themselves(page: Any, address: str) -> None:
+    page.goto(f"{address}/assets/step")
+    shown = page.get_by_role("link", name="Help: Timeline")
+    playwright.expect(shown).to_have_attribute("href", "/help/how-to/dashboard.html#pages")
+    playwright.expect(page.get_by_role("link", name="Help: Verdict")).to_be_visible()
+    meaning = "what healthy looks like: learned from recordings, or computed from the plant's nominal parameters"
+    page.goto(f"{address}/learn")
+    playwright.expect(page.locator("dfn", has_text="baseline").first).to_have_attribute("title", meaning)
+
+
+def test_an_example_leads_to_a_verdict(page: Any, address: str) -> None:
+    page.goto(f"{address}/diagnose")
+    page.get_by_role("button", name="Try it with an example").click()
+    playwright.expect(page.get_by_label("Compare with the baseline")).to_have_value("example-axis", timeout=LONG_MS)
+    playwright.expect(page.get_by_label("Input u", exact=True)).to_have_value("Motor voltage (V)")
+    page.get_by_role("button", name="Diagnose", exact=True).click()
+    page.wait_for_url("**/diagnoses/*", timeout=LONG_MS)
+    verdict = page.get_by_role("region", name="Verdict")
+    playwright.expect(verdict).to_contain_text("friction at speed has risen by a quarter")

@@ -20,7 +20,7 @@ from servoscope.service.metrics import MetricsContext, ServiceMetrics
 from servoscope.service.notifications import Notifier
 from servoscope.service.sources.message import RejectionCounter
 from servoscope.service.store import CommandOutcome, Row, Store
-from servoscope.service.store.rows import RELEARN
+from servoscope.service.store.rows import RELEARN, TEST
 from servoscope.service.store.series import thin_sizes
 
 DAY_S = 86400.0
@@ -132,14 +132,15 @@ class Housekeeping:
             return
         now = service.clock.now() if asset is None or asset.state is None else asset.state.position.t
         until = now + document["for_s"] if document.get("for_s") is not None else None
-        command = OperatorCommand(LifecycleEvent(row["command"]), row["who"], document.get("why", ""), until)
         outcome = CommandOutcome(accepted=True)
         try:
-            if asset is not None:
-                service.handle_result(asset, asset.execute(row["alarm"], command))
+            if row["command"] == TEST:
+                service.writer.add(name, notifier.try_sink(row["alarm"], row["who"], now))
+            elif asset is not None:
+                service.handle_result(asset, asset.execute(row["alarm"], _operator_command(row, until)))
                 service.writer.set_checkpoint(asset)
             else:
-                self._handle_own(notifier.execute(row["alarm"], command, now), now)
+                self._handle_own(notifier.execute(row["alarm"], _operator_command(row, until), now), now)
         except AlarmError as error:
             outcome = CommandOutcome(accepted=False, refusal=str(error))
         document = outcome.extend(document)
@@ -169,6 +170,10 @@ class Housekeeping:
             self._thinned[name] = self._to_thin.pop(name)
         if thinned:
             log("info", "old sizes thinned", rows=thinned)
+
+
+def _operator_command(row: Row, until: float | None) -> OperatorCommand:
+    return OperatorCommand(LifecycleEvent(row["command"]), row["who"], row["document"].get("why", ""), until)
 
 
 def delete_old_rows(

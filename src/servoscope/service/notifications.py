@@ -177,6 +177,12 @@ class Notifier:
         self._rows += len(rows)
         return StepResult(rows, list(transitions))
 
+    def try_sink(self, sink: str, who: str, now: float) -> list[TableRow]:
+        """Return the rows with which somebody tries a sink; raises AlarmError where it may not be tried."""
+        if sink not in self._settings.sinks or sink in self._settings.executing:
+            raise AlarmError(f"{sink!r} cannot be tried: it is not in [actions], or changes a machine")
+        return [self._outbox_row(actions.trial_entry(sink, self.name, who, now))]
+
     def accommodate_fault(self, asset: str, diagnosis: StoredDiagnosis | None, t: float, now: float) -> list[TableRow]:
         """Take a full diagnosis of an asset, or None when its fault is over; return rows about changes for it."""
         rows: list[TableRow] = []

@@ -21,14 +21,27 @@ from starlette.types import ASGIApp
 from servoscope import __version__
 from servoscope.core.messages import catalogue, current_language, languages
 from servoscope.service.health import HEALTH_PATHS, HealthReport
+from servoscope.simulation.tutorial import DAYS, tutorial_log
 from servoscope.web import errors
 from servoscope.web.dependencies import Context
 from servoscope.web.metrics import WebMetrics
 from servoscope.web.middleware import API, SecurityMiddleware
-from servoscope.web.routes import alarms, assets, baselines, designs, diagnoses, events, relearning, session, uploads
+from servoscope.web.routes import (
+    alarms,
+    assets,
+    baselines,
+    designs,
+    diagnoses,
+    events,
+    notifications,
+    relearning,
+    session,
+    uploads,
+)
 
+HELP = "/help"  # where the documentation is
 CLEANUP_S = 3600.0  # between two removals of expired uploads
-ROUTE_MODULES = (session, assets, alarms, events, diagnoses, uploads, baselines, designs, relearning)
+ROUTE_MODULES = (session, assets, alarms, events, diagnoses, uploads, baselines, designs, relearning, notifications)
 
 
 def create_app(context: Context) -> ASGIApp:
@@ -111,7 +124,17 @@ def _add_pages(app: FastAPI) -> None:
         headers = {"Cache-Control": "no-cache", "Vary": "Accept-Language, Cookie"}
         return Response(text, media_type="text/javascript", headers=headers)
 
+    @app.get("/static/examples/{day}.csv", include_in_schema=False)
+    def get_example(day: str) -> Response:
+        if day not in DAYS:
+            raise HTTPException(404, f"there is no example of {day}")
+        return Response(tutorial_log(day), media_type="text/csv")
+
     app.mount("/static", GZipMiddleware(_NoCacheFiles(directory=folder, check_dir=False), minimum_size=1000))
+
+    site = folder.parents[1] / "site"  # which wheels bring: see `servoscope docs`
+    if site.is_dir():
+        app.mount(HELP, GZipMiddleware(_NoCacheFiles(directory=site, html=True), minimum_size=1000))
 
     @app.api_route("/{path:path}", methods=["GET", "HEAD"], include_in_schema=False)
     async def get_page(request: Request, path: str) -> Response:

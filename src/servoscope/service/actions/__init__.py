@@ -18,6 +18,7 @@ from servoscope.service.actions.outbox import (
     flood_entries,
     idempotency_key,
     transition_entries,
+    trial_entry,
 )
 from servoscope.service.actions.settings import (
     ActionSettings,
@@ -34,5 +35,5 @@ __all__ = [
     "FaultToleranceSettings",
     "FaultToleranceState", "MqttMessageSettings", "OutboxEntry", "RetrySettings", "WebhookSettings",
     "accommodate_fault", "deliver", "diagnosis_entries", "flood_entries", "idempotency_key",
-    "signature", "transition_entries",
+    "signature", "transition_entries", "trial_entry",
 ]  # fmt: skip

@@ -23,6 +23,7 @@ from servoscope.service.actions.outbox import DeliveryAttempt, OutboxEntry, sche
 from servoscope.service.actions.settings import (
     PLACEHOLDERS,
     SINK_NAMES,
+    TEST_EVENT,
     ActionSettings,
     CommandSettings,
     EmailSettings,
@@ -74,7 +75,9 @@ def deliver_together(
             row.attempts + 1,
             failure is None,
             outcome,
-            None if failure is None else schedule_retry(settings.retry, row, now, failure.min_wait_s),
+            None
+            if failure is None or row.event.get("event") == TEST_EVENT
+            else schedule_retry(settings.retry, row, now, failure.min_wait_s),
         )
         for row in rows
     ]

@@ -13,10 +13,10 @@ from email.message import EmailMessage
 from email.utils import formatdate
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from servoscope.core.messages import message, render
-from servoscope.service.actions.settings import EmailSettings
+from servoscope.service.actions.settings import TEST_EVENT, EmailSettings
+from servoscope.service.asset_link import page_address, qr_code
 
 HOUR_S = 3600.0
 PORTS = {"tls": 465, "starttls": 587, "none": 587}
@@ -122,10 +122,15 @@ def compose_mail(key: str, events: Sequence[dict[str, Any]], settings: EmailSett
     mail["Subject"] = " ".join(f"[{first.get('service', 'servoscope')}] {subject}".split())
     mail["Message-ID"], mail["Auto-Submitted"] = f"<{key}@servoscope>", "auto-generated"
     mail.set_content("\n\n".join(_describe_event(event, settings.address) for event in events) + "\n")
+    if settings.address is not None and len(events) == 1:
+        code = qr_code(_event_address(first, settings.address), "png")
+        mail.add_attachment(code, maintype="image", subtype="png", filename="servoscope.png", disposition="inline")
     return mail
 
 
 def _subject(event: dict[str, Any]) -> str:
+    if event.get("event") == TEST_EVENT:
+        return str(event["cause"])
     if "asset" not in event:  # of a flood
         return render(message("service.mail.flood", event=event["event"], count=event.get("counted", 0)))
     words = {"asset": event["asset"], "alarm": event["alarm"], "priority": event["priority"]}
@@ -140,7 +145,11 @@ def _describe_event(event: dict[str, Any], address: str | None) -> str:
     lines = [str(text) for text in texts if text]
     lines.append(render(message("service.mail.time", t=event["time"])))
     if address is not None:
-        asset = event.get("asset")
-        has_page = asset not in (None, event.get("service"))  # the service's own alarms have none
-        lines.append(address.rstrip("/") + (f"/assets/{quote(str(asset), safe='')}" if has_page else "/"))
+        lines.append(_event_address(event, address))
     return "\n".join(lines)
+
+
+def _event_address(event: dict[str, Any], address: str) -> str:
+    asset = event.get("asset")
+    has_page = asset not in (None, event.get("service"))  # the service's own alarms have none
+    return page_address(address, str(asset) if has_page else None)

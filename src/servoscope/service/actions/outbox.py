@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from servoscope.service.actions.settings import DIAGNOSIS_EVENT, ActionSettings, RetrySettings
+from servoscope.core.messages import message, render
+from servoscope.service.actions.settings import DIAGNOSIS_EVENT, TEST_EVENT, ActionSettings, RetrySettings
 from servoscope.service.alarms import AlarmState, AlarmTransition, LifecycleState, Notification, Priority, alarm_kind
 
 QUIET_STATES = (  # in which nobody has to answer an alarm
@@ -122,6 +123,16 @@ def flood_entries(settings: ActionSettings, notice: Notification, now: float) ->
     event = {"event": notice.kind, "time": notice.time, "counted": notice.counted, "peak": notice.peak}
     sinks = [name for name, sink in settings.sinks.items() if sink.alarms is sink.assets is sink.events is None]
     return tuple(_entry(name, key, event, now) for name in sinks)
+
+
+def trial_entry(sink: str, service: str, who: str, now: float) -> OutboxEntry:
+    """Return the entry with which somebody tries a sink; it is attempted once."""
+    cause = render(message("service.trial", who=who))
+    event = {
+        "time": now, "asset": service, "alarm": TEST_EVENT, "before": LifecycleState.NORMAL.value,
+        "after": LifecycleState.NORMAL.value, "event": TEST_EVENT, "cause": cause, "who": who, "priority": "low",
+    }  # fmt: skip
+    return _entry(sink, (TEST_EVENT, repr(now)), event, now)
 
 
 def _entry(sink: str, parts: tuple[str | int, ...], event: dict[str, Any], now: float) -> OutboxEntry:

@@ -28,6 +28,7 @@ ActionName = Annotated[str, Field(strict=True), AfterValidator(_check_name)]
 PositiveInt = Annotated[int, Field(strict=True, ge=1)]
 
 DIAGNOSIS_EVENT = "diagnosed"  # an event that is none of the life-cycle: the cause of an alarm is known
+TEST_EVENT = "test"  # another: somebody tries whether notifications arrive
 MAX_RATIO = 1e3  # ratio to healthy, or its inverse, beyond which a change is not left to a formula
 PLACEHOLDERS = ("key", "time", "asset", "alarm", "event", "after", "priority", "quantity", "value", "previous")
 
@@ -223,6 +224,11 @@ class ActionSettings(Settings):
             }
 
         return self.model_copy(update={key: renamed(getattr(self, key)) for key in SINKS})
+
+    @property
+    def executing(self) -> set[str | None]:
+        """Names of the sinks that change a machine, and are not tried therefore."""
+        return {one.sink for one in self.tolerance.values()}
 
     @property
     def sinks(self) -> dict[str, Sink]:

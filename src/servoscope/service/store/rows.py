@@ -12,6 +12,7 @@ Row = Mapping[str, Any]  # of any table
 CHECKS = "checks"  # in the audit: what to check on an asset for a fault, in its owner's words
 NOTE = "note"  # in the audit: what somebody noted about an asset
 RELEARN = "relearn"  # command: take the baseline that an asset has now
+TEST = "test"  # command: try a webhook, command, message or mail, whose name is in the place of an alarm's
 SIZE_EVERY_S = 600.0  # between two stored values of a coefficient
 # how the outcome of a refused command begins in rows of version 0.1, which have no fields for it
 REFUSAL_PREFIX = "refused: "

@@ -3,6 +3,7 @@ import { get, mayChange, part, query } from "./api.js";
 import { commands, sendCommand, STATES } from "./commands.js";
 import { h, section, table, tell, translate } from "./dom.js";
 import { follow } from "./live.js";
+import { outlets } from "./notifications.js";
 import { priority, prose } from "./marks.js";
 import { DASH, duration, moment, plain } from "./words.js";
 
@@ -27,6 +28,7 @@ export async function show(main, { session, signal, linked, values }) {
     flood,
     standing,
     said,
+    ...[await outlets(session, signal)].filter(Boolean),
     section("What has happened", "Every step of every alarm, with its cause and who wanted it.", past),
   );
   state.addEventListener("change", draw);

@@ -49,7 +49,7 @@ export async function show(main, { session, signal, linked, values, part: name, 
   const baseline = asset.baseline && h("a", { href: `/design?baseline=${part(asset.baseline)}` }, "What this baseline can tell apart");
 
   main.replaceChildren(
-    h("div", { class: "head" }, h("h1", {}, name), h("span", { class: "note" }, about), h("span", { class: "gap" }), baseline, h("button", { type: "button", class: "screen", onclick: () => print() }, "Print")),
+    h("div", { class: "head" }, h("h1", {}, name), h("span", { class: "note" }, about), h("span", { class: "gap" }), baseline, h("details", { class: "code" }, h("summary", {}, "On a phone"), h("img", { src: `/api/v1${path}/code.svg`, alt: translate("QR code of this page"), loading: "lazy" })), h("button", { type: "button", class: "screen", onclick: () => print() }, "Print")),
     top.element,
     certainty,
     h(

@@ -44,7 +44,7 @@ export async function show(main, { session, signal, values }) {
     chosen.replaceChildren(...steps(one, session, signal));
   };
   const note = "A minute or more of the healthy machine at work: set point (reference r), output of the controller (input u), measured motion (output y).";
-  work.append(section("Log", note, dropzone("Drop a log here", false, open, signal, () => chosen.replaceChildren()), (await earlier(open, signal)) ?? ""), chosen);
+  work.append(section("Log", note, dropzone("Drop a log here", open, signal, { begun: () => chosen.replaceChildren(), examples: ["monday"] }), (await earlier(open, signal)) ?? ""), chosen);
   if (values.get("upload")) await get(`/uploads/${part(values.get("upload"))}`, signal).then(open, () => {}); // if it is still there
 }
 

@@ -5,7 +5,9 @@ import { list } from "./asset.js";
 import { during, field, h, section } from "./dom.js";
 import { inspected } from "./inspection.js";
 import { kept } from "./kept.js";
-import { dropzone, earlier, mapping, preview } from "./uploads.js";
+import { dropzone, earlier, exampleBaseline, mapping, preview } from "./uploads.js";
+
+const EXAMPLE = "example-axis"; // name of the baseline
 
 export async function show(main, { session, signal, values }) {
   const past = h("div", {});
@@ -17,10 +19,19 @@ export async function show(main, { session, signal, values }) {
     work.replaceChildren(h("p", { class: "note" }, "Uploading a recording is for operators and engineers; you can look at what they found."));
     return;
   }
-  const { baselines } = await get("/baselines", signal);
+  let { baselines } = await get("/baselines", signal);
   const chosen = h("div", { class: "steps" });
-  const open = (one) => chosen.replaceChildren(...steps(one, baselines, values.get("baseline"), signal));
-  work.append(section("Recording", null, dropzone("Drop a recording here", false, open, signal, () => chosen.replaceChildren()), (await earlier(open, signal)) ?? ""), chosen);
+  let wanted = values.get("baseline");
+  const open = (one) => chosen.replaceChildren(...steps(one, baselines, wanted, signal));
+  // The example's baseline is learned once, by somebody who may.
+  const prepare = async (step) => {
+    if (!baselines.some((one) => one.id === EXAMPLE) && mayChange(session.role, "engineer")) {
+      await exampleBaseline(EXAMPLE, step, signal);
+      ({ baselines } = await get("/baselines", signal));
+    }
+    wanted = EXAMPLE;
+  };
+  work.append(section("Recording", null, dropzone("Drop a recording here", open, signal, { begun: () => chosen.replaceChildren(), examples: ["friday"], prepare }), (await earlier(open, signal)) ?? ""), chosen);
   const known = values.get("upload");
   if (known) open(await get(`/uploads/${part(known)}`, signal));
 }

@@ -1,5 +1,5 @@
 // A document as the server makes it of a result: the verdict with what to check, sections, and folded what experts ask for.
-import { h, section, table } from "./dom.js";
+import { h, help, section, table } from "./dom.js";
 import { mark, prose } from "./marks.js";
 
 const [HEADLINE, EVIDENCE, DETAILS] = [0, 1, 2];
@@ -13,6 +13,7 @@ export function verdict(kind, sections, action = null) {
     "div",
     { class: `verdict ${kind}`, role: "region", "aria-label": "Verdict" },
     h("h2", {}, mark(kind), " ", h("span", {}, prose(first.title.charAt(0).toUpperCase() + first.title.slice(1)))),
+    help("Verdict"),
     of(true).flatMap((it) => it.texts.map((text) => h("p", { class: "summary" }, prose(text)))),
     todo.map((one) => [h("h3", {}, one.title), one.body.map((it) => part(it, one.title))]),
     action,

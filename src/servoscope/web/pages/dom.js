@@ -1,5 +1,6 @@
 // Elements without markup in strings: what comes from outside is text, never HTML. What stands in the catalogue is shown in the
 // reader's language; what is data, the name of a column for example, goes into an element with translate="no".
+import { pieces, topic } from "./help.js";
 import { translate } from "./translate.js";
 
 export { translate };
@@ -70,13 +71,20 @@ export function field(label, control, hint = null) {
   return h("label", { class: "field" }, h("span", {}, label), control, hint && h("small", {}, hint));
 }
 
+// A sentence in the reader's language, in which words of the glossary say what they mean.
+export const explained = (text) => pieces(text).map(([piece, meaning]) => (meaning ? h("dfn", { title: meaning }, piece) : piece));
+
+// What opens the documentation of a section.
+export const help = (title) => h("a", { class: "help screen", href: topic(title), target: "_blank", hreflang: "en", "aria-label": `${translate("Help")}: ${translate(title)}` }, "?");
+
 export function section(title, note, ...children) {
-  return h("section", {}, h("h2", {}, title), note && h("p", { class: "note" }, note), ...children);
+  const words = typeof note === "string" ? explained(translate(note)) : note;
+  return h("section", {}, h("h2", {}, title), help(title), note && h("p", { class: "note" }, words), ...children);
 }
 
 // The same with controls beside the title.
 export function titled(title, controls, ...children) {
-  return h("section", {}, h("div", { class: "titled" }, h("h2", {}, title), controls), ...children);
+  return h("section", {}, h("div", { class: "titled" }, h("h2", {}, title), controls, help(title)), ...children);
 }
 
 // What went wrong, said where it matters; screen readers hear it at once.

@@ -5,7 +5,7 @@ import { findings, inspected } from "./inspection.js";
 import { kept } from "./kept.js";
 import { loopChoice } from "./loops.js";
 import { mark, prose } from "./marks.js";
-import { dropzone, earlier, mapping, preview } from "./uploads.js";
+import { dropzone, earlier, exampleLoop, mapping, preview } from "./uploads.js";
 import { change, count, DASH, duration, general, moment, number, plain, withStd } from "./words.js";
 
 const FEWEST = 5; // like machines, of which something in common is known
@@ -83,7 +83,7 @@ export async function show(main, { session, signal, values }) {
   );
   work.append(
     section("Loop", ["What is known of it: sampling, plant, controller. A baseline has it inside. Without a loop file ", h("a", { href: "/begin" }, "begin with a log"), "."], loop.element),
-    section("Healthy recordings", "Take several days and temperatures: then the baseline includes their scatter.", dropzone("Drop healthy recordings here", true, add, signal), (await earlier(add, signal)) ?? "", listed, columns, machines.element, h("div", { class: "actions" }, learn, look, said)),
+    section("Healthy recordings", "Take several days and temperatures: then the baseline includes their scatter.", dropzone("Drop healthy recordings here", add, signal, { several: true, examples: ["monday", "tuesday"], prepare: async (step) => loop.take(await exampleLoop(step, signal)) }), (await earlier(add, signal)) ?? "", listed, columns, machines.element, h("div", { class: "actions" }, learn, look, said)),
     result,
   );
   for (const id of values.getAll("upload")) await get(`/uploads/${part(id)}`, signal).then(add, () => {}); // those that are still there
@@ -98,7 +98,7 @@ function judged(each, inspection, open = null) {
 
 function learned(found, refresh) {
   const points = found.summary.points ? Object.entries(found.summary.points) : [["", found.summary]];
-  const name = h("input", { required: true, pattern: "[\\w][\\w.:\\-]*", title: "letters, digits, . : - _", oninput: () => (button.disabled = false) });
+  const name = h("input", { required: true, pattern: "[\\w][\\w.:\\-]*", title: "letters, digits, . : - _", value: (found.summary.loop ?? "").replace(/[^\w.-]+/g, "-"), oninput: () => (button.disabled = false) });
   const button = h("button", { class: "first" }, "Save");
   const [said, link] = [h("div", { role: "status", class: "working" }), h("div", {})];
   const save = async (event) => {

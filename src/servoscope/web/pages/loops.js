@@ -18,13 +18,13 @@ export async function loopChoice(id, signal, wanted = null) {
     shown.hidden = select.value !== OWN;
     edit.hidden = !chosen()?.toml;
   };
-  edit.addEventListener("click", () => {
-    text.value = chosen().toml;
+  const take = (toml) => {
+    text.value = toml;
     select.value = OWN;
     for (const each of [select, text]) each.dispatchEvent(new Event("input", { bubbles: true }));
     refresh();
-    text.focus();
-  });
+  };
+  edit.addEventListener("click", () => (take(chosen().toml), text.focus()));
   select.addEventListener("change", refresh);
   refresh();
   const element = h("div", {}, h("div", { class: "actions" }, field("Loop", select), edit), shown);
@@ -33,7 +33,7 @@ export async function loopChoice(id, signal, wanted = null) {
   const columns = () => (select.value === OWN ? /^\s*\[columns\]/m.test(text.value) || null : chosen().columns);
   const changed = (then) => [select, edit, text].forEach((each) => each.addEventListener(each === edit ? "click" : "change", then));
   const units = () => chosen()?.units ?? null;
-  return { element, columns, units, changed, read: () => (select.value === OWN ? { toml: text.value } : chosen().ref) };
+  return { element, columns, units, changed, take, read: () => (select.value === OWN ? { toml: text.value } : chosen().ref) };
 }
 
 const keyOf = (one) => Object.entries(one.ref).flat().join(" ");

@@ -1,5 +1,5 @@
 // States as shapes: colour is never the only thing that tells them apart.
-import { h, s, translate } from "./dom.js";
+import { explained, h, s, translate } from "./dom.js";
 import { sentence } from "./words.js";
 
 const SHAPES = {
@@ -46,8 +46,8 @@ export function priority(name) {
 export function prose(text) {
   return sentence(translate(text))
     .split(/\b([A-Za-z]{1,2}_[A-Za-z]\w{0,2})\b/)
-    .map((part, i) => {
-      if (i % 2 === 0) return part;
+    .flatMap((part, i) => {
+      if (i % 2 === 0) return explained(part);
       const [letter, index] = part.split("_");
       return h("span", {}, h("i", {}, letter), h("sub", {}, index));
     });

@@ -6,11 +6,12 @@ import { h, section, translate } from "./dom.js";
 import { VERDICTS } from "./marks.js";
 import { moment, plain, sentence } from "./words.js";
 
-const ROWS = ["Fault", "Data", "Other alarms", "Answers", "Notes", "Diagnoses"]; // from above
+const ROWS = ["Fault", "Data", "Other alarms", "Answers", "Repairs", "Baselines", "Notes", "Diagnoses"]; // from above
 const STEPS = 200;
 const ACTIVE = ["unacknowledged", "acknowledged"];
 const GONE = ["normal", "returned_unacknowledged", "latched_unacknowledged", "latched_acknowledged"];
 const PEOPLE = ["acknowledge", "reset", "shelve", "unshelve", "remove_from_service", "return_to_service"];
+const rowOfNote = ({ kind, anew }) => (kind === "baseline" ? "Baselines" : anew || kind !== "note" ? "Repairs" : "Notes");
 const rowOf = (alarm) => (alarm === "fault" ? "Fault" : ["data_quality", "reception"].includes(alarm.split(":")[0]) ? "Data" : "Other alarms");
 
 export function timeline(path, asset, signal) {
@@ -24,7 +25,7 @@ export function timeline(path, asset, signal) {
     entries = [
       ...bars(alarms.transitions, asset(), diagnoses),
       ...alarms.transitions.filter((one) => PEOPLE.includes(one.event)).map((one) => ({ row: "Answers", from: one.t, words: `${plain(one.alarm)}: ${translate(STATES[one.after])}${one.who ? ` (${one.who})` : ""}` })),
-      ...notes.map((one) => ({ row: "Notes", from: one.t, words: `${one.text} (${one.who})` })),
+      ...notes.map((one) => ({ row: rowOfNote(one), from: one.t, words: `${one.text} (${one.who})` })),
       ...diagnoses.filter((one) => one.grounds === "full").map((one) => ({ row: "Diagnoses", from: one.t, words: `${VERDICTS[one.verdict]}: ${sentence(one.summary)}` })),
     ];
     element.hidden = !entries.length;
@@ -62,7 +63,7 @@ const told = ({ from, to, words }, end) => `${moment(from)}${to === undefined ? 
 function drawn(c, entries, { t }) {
   const rows = ROWS.filter((row) => entries.some((one) => one.row === row));
   const names = [...rows].reverse().map(translate);
-  const colour = { Fault: c.alarm, Data: c.care, "Other alarms": c.care, Answers: c.healthy, Notes: c.ink, Diagnoses: c.measured };
+  const colour = { Fault: c.alarm, Data: c.care, "Other alarms": c.care, Answers: c.healthy, Repairs: c.ink, Baselines: c.check, Notes: c.ink, Diagnoses: c.measured };
   const series = rows.flatMap((row) => {
     const own = entries.filter((one) => one.row === row);
     const at = (time) => [1000 * time, translate(row)];

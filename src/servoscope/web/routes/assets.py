@@ -5,15 +5,16 @@ from __future__ import annotations
 import functools
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Query, Request, Response
 from starlette.exceptions import HTTPException
 
 from servoscope.core.errors import LoopError, StoreError, StoreUnavailableError
 from servoscope.design.operating_limits import OperatingLimit, operating_limits
 from servoscope.prognosis.forecast import prognose
+from servoscope.service.asset_link import page_address, qr_code
 from servoscope.service.assets.status import AssetStatus
 from servoscope.service.sources.block import Block
 from servoscope.service.store import Store
@@ -43,6 +44,9 @@ router = APIRouter(tags=["assets"], dependencies=[VIEWER])
 
 DAY_S = 86400.0
 FIRST_BLOCKS = 16  # of an asset's newest samples that are read at first, as their length is not known
+SVG_RESPONSES: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"image/svg+xml": {"schema": {"type": "string"}}}, "description": "The picture"}
+}
 UNKNOWN_RESIDUAL = (None, None, None)
 
 
@@ -87,6 +91,15 @@ def get_asset(context: ContextDep, asset: str) -> schemas.AssetDetail:
     """Return all that is known of an asset now."""
     stored, status = find_asset(context, asset)
     return build_asset_detail(context, asset, stored.at, status)
+
+
+@router.get("/assets/{asset}/code.svg", response_class=Response, responses=SVG_RESPONSES)
+def get_code(context: ContextDep, request: Request, asset: str) -> Response:
+    """Return the QR code that leads a phone to its page."""
+    find_asset(context, asset)
+    scheme = "https" if context.settings.secure else request.url.scheme
+    link = page_address(f"{scheme}://{request.headers['host']}", asset)
+    return Response(qr_code(link, "svg"), media_type="image/svg+xml")
 
 
 @router.get("/assets/{asset}/history")
