@@ -10,23 +10,32 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 import servoscope as ss
 from golden.results import FOLDER
 from servoscope import report
-from servoscope.cli.render import results
+from servoscope.assessment import assess
+from servoscope.cli.render import history, results
+from servoscope.cli.render.assessment import print_assessment
 from servoscope.cli.render.diagnosis import print_diagnosis
+from servoscope.cli.service import COLUMNS
 from servoscope.core import messages
 from servoscope.core.messages import catalogue, languages, message, render, translate
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.learning.inspection import inspect
 from servoscope.models import plants
 from servoscope.models.plants import axis
+from servoscope.prognosis.forecast import prognose
+from servoscope.prognosis.series import SizeSeries
 from servoscope.report.document import DETAILS
 from servoscope.report.inspection_page import render_inspection_page
+from servoscope.service.assets.reception import Reception
+from servoscope.service.commissioning import CommissioningRow
 
+NOW = 1767225690.0
 OPEN, CLOSE = "\N{MATHEMATICAL LEFT WHITE SQUARE BRACKET}", "\N{MATHEMATICAL RIGHT WHITE SQUARE BRACKET}"
 OTHERS = [name for name in languages() if name != "en"]
 # English words that no text of another language has; symbols, file names and settings are English everywhere
@@ -96,8 +105,8 @@ def outside_of_messages(text: str) -> str:
     return "".join(left)
 
 
-def test_no_sentence_is_left_outside_of_the_catalogue(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports and terminal, in a language made of the keys: each message and each word stands between marks."""
+def add_marked_language(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Add the language zz, in which each message and each word stands between marks."""
     english = {key: text.replace("|", f"{CLOSE}|{OPEN}") if key.startswith("count.") else text
                for key, text in catalogue("en").items()}  # fmt: skip
     words = {key: key.partition(".")[2] for key in catalogue("de") if key.startswith("word.")}
@@ -105,6 +114,48 @@ def test_no_sentence_is_left_outside_of_the_catalogue(monkeypatch: pytest.Monkey
     monkeypatch.setattr(
         messages, "catalogue", lambda language="en": marked if language == "zz" else catalogue(language)
     )
+
+
+STATUS = {
+    "verdict": "fault", "since": NOW, "statistic": 2.0, "level": 0.5, "ne107": "failure", "counted": {"t": NOW},
+    "alarms": {"data_quality": {"state": "returned_unacknowledged"}, "fault": {"state": "shelved"}},
+    "residual": [(1.0, 1.0, 1.0, 2.0)], "summary": "",
+}  # fmt: skip
+FLOOD = {"service": True, "flood": {"since": NOW, "held": 2}, "alarms": {"buffering": {"state": "unacknowledged"}}}
+
+
+def test_no_word_of_assess_trend_watch_history_and_arm_is_left_outside(monkeypatch: pytest.MonkeyPatch) -> None:
+    add_marked_language(monkeypatch)
+    monkeypatch.setattr(messages, "LANGUAGE", "zz")
+    terminal = io.StringIO()
+    console = Console(file=terminal, width=250)
+    statuses = {"P1": {"at": NOW, "status": STATUS}, "H": {"at": NOW, "status": FLOOD}}
+    console.print(history.status_page(statuses, 250))
+    heard = Reception("silent", "")
+    console.print(history.commissioning_table([CommissioningRow("P1", "S", heard, 3, 100.0, 100.0, 2.0)]))
+    for kind, columns in COLUMNS.items():
+        row = dict.fromkeys(columns, "") | {"event": {}, "outcome": "", "document": {}}
+        row |= {"what": "note", "after": "shelved", "grounds": "full", "t": NOW, "statistic": 1.0, "level": 1.0}
+        assert kind
+        console.print(history.row_table([row], columns))
+    t = np.arange(0.0, 60.0, 0.1)
+    for wave in (0.1 * np.sin(t), 0.0 * t):
+        log = {"t": t, "r": np.ones_like(t), "u": 0.5 - wave, "y": 1.0 + wave}
+        print_assessment(console, assess(log))
+    months = 2.6e6 * np.arange(12.0)
+    for growth in (0.02, 0.0):
+        ratio = 1.0 + growth * np.arange(12.0)
+        found = prognose(SizeSeries("P1", months, ratio, np.full(12, 0.01)), 2.0)
+        console.print(found.summary, *found.explanation, sep="\n")
+    assert len(terminal.getvalue()) > 2000
+    left = sorted(set(re.findall(r"[a-z]{3,}", outside_of_messages(terminal.getvalue()))))
+    left = [word for word in left if word not in ("arrays", "note")]
+    assert " ".join(left) == ""
+
+
+def test_no_sentence_is_left_outside_of_the_catalogue(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports and terminal, in a language made of the keys: each message and each word stands between marks."""
+    add_marked_language(monkeypatch)
     baseline = ss.Baseline.load(FOLDER / "rig.json")
     recording = ss.read(FOLDER / "healthy.parquet", baseline.loop)
     # in English first: a template is compiled once, and its words must follow the reader all the same

@@ -67,7 +67,9 @@ def test_a_test_goes_the_way_of_an_alarm_and_is_tried_once(context: Context) -> 
     )
     Housekeeping(service)._execute_commands()
     outbox, audit = added["hall"]
-    assert audit.table == "audit" and audit.values["who"] == "local" and batch.outcomes[command["id"]]["outcome"] == "done"
+    assert (
+        audit.table == "audit" and audit.values["who"] == "local" and batch.outcomes[command["id"]]["outcome"] == "done"
+    )
     entry = OutboxEntry(**{key: value for key, value in outbox.values.items() if key != "outcome"})
     assert entry.event["cause"] == "Test, asked for by local: notifications arrive here"
     attempt = deliver(entry, settings, 1.7e9)

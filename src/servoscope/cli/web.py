@@ -11,6 +11,7 @@ import typer
 from servoscope.cli.app import app
 from servoscope.cli.exit import print_json
 from servoscope.cli.service import check_web_extra
+from servoscope.core.messages import message, render, translate
 from servoscope.service.access import ROLES, Role, Users
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ def serve(
     missing = "://" not in url and not (here / url).exists()
     opened = Store.open(url, here, write=missing, lock_timeout_s=STORE_TIMEOUT_S)
     if missing:
-        typer.echo(f"servoscope: {opened.name} is new, and empty until servoscope run follows assets", err=True)
+        typer.echo(render(message("cli.new_store", name=opened.name)), err=True)
     run_server(settings, opened, service, here, with_parent=with_parent)
 
 
@@ -111,9 +112,9 @@ def add(
     if password_stdin:
         password = sys.stdin.readline().rstrip("\n")
     else:
-        password = typer.prompt("Password", hide_input=True, confirmation_prompt=True)
+        password = typer.prompt(translate("Password"), hide_input=True, confirmation_prompt=True)
     known.add(name, chosen, password)
-    typer.echo(f"{file}: {name} is {chosen}")
+    typer.echo(render(message("cli.user", file=str(file), name=name, role=chosen)))
 
 
 @users_app.command("list")
@@ -126,11 +127,11 @@ def print_users(
         print_json(users, lines=False)
     else:
         for name, role in sorted(users.items()):
-            typer.echo(f"{name}  {role}")
+            typer.echo(f"{name}  {translate(role)}")
 
 
 @users_app.command()
 def remove(name: NameArgument, file: UsersOption = DEFAULT_USERS_FILE) -> None:
     """Remove a user; its sessions end."""
     Users(file).remove(name)
-    typer.echo(f"{file}: {name} is removed")
+    typer.echo(render(message("cli.no_user", file=str(file), name=name)))

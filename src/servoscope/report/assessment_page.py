@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from servoscope.assessment import Assessment
+from servoscope.core.messages import translate
 from servoscope.report.format_values import DASH, format_duration, format_percent
 from servoscope.report.page import ResultTable, render_page, say, write_page
 
@@ -63,12 +64,12 @@ def facts(a: Assessment) -> Iterator[tuple[str, str]]:
 def cause_table(a: Assessment) -> ResultTable:
     """Return the probability of each cause, the likeliest first."""
     ordered = sorted(a.probabilities.items(), key=lambda pair: -pair[1])
-    return ResultTable(("Cause", "Probability"), [(cause, f"{p:.2f}") for cause, p in ordered if p >= 0.005])
+    return ResultTable(("Cause", "Probability"), [(translate(cause), f"{p:.2f}") for cause, p in ordered if p >= 0.005])
 
 
 def index_table(a: Assessment) -> ResultTable:
     """Return the textbook indices and the log-likelihoods of the competing models."""
-    return ResultTable(("Index", "Value"), [(name, f"{value:.3f}") for name, value in a.indices.items()])
+    return ResultTable(("Index", "Value"), [(translate(name), f"{value:.3f}") for name, value in a.indices.items()])
 
 
 def ranking_table(ranked: Sequence[Assessment]) -> ResultTable:

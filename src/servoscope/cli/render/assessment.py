@@ -13,7 +13,7 @@ from servoscope.assessment.plant_loops import group_by_period
 from servoscope.cli.render.results import INDENT, print_facts, print_notes, print_result_table, print_title
 from servoscope.core.messages import translate
 from servoscope.report.assessment_page import assessment_size, facts, index_table, ranking_table
-from servoscope.report.page import say
+from servoscope.report.page import ResultTable, say
 
 __all__ = ["print_assessment", "print_ranking", "ranking_table"]
 
@@ -33,7 +33,9 @@ def print_assessment(out: Console, a: Assessment) -> None:
 
 def print_ranking(out: Console, ranked: Sequence[Assessment]) -> None:
     """Print the worst loops first, and which of them oscillate together."""
-    print_result_table(out, ranking_table(ranked))
+    table = ranking_table(ranked)
+    rows = [(log, translate(verdict), *others) for log, verdict, *others in table.rows]
+    print_result_table(out, ResultTable(table.head, rows, table.words))
     for group in group_by_period(ranked):
         names = [a.recording for a in group]
         print_notes(out, [say("assess.group", names=names, period=group[0].period_s, source=names[0])])

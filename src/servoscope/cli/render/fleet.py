@@ -25,7 +25,7 @@ def print_fleet(out: Console, f: Fleet) -> None:
     from servoscope.fleet.report import describe_discoveries, headline
 
     colour = COLOURS["fault" if f.count("fault") or f.accepted else "healthy"]
-    out.print(Text.assemble((count_words(len(f.assets), "asset", "en"), "bold"), ": ", (headline(f), f"bold {colour}")))
+    out.print(Text.assemble((count_words(len(f.assets), "asset"), "bold"), ": ", (headline(f), f"bold {colour}")))
     if told := describe_discoveries(f):
         out.print(told, soft_wrap=True)
     states = ("healthy", "fault", "common cause", "undetermined", "failed")

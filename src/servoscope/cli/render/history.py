@@ -11,7 +11,8 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from servoscope.cli.render.results import COLOURS
+from servoscope.cli.render.results import COLOURS, build_table
+from servoscope.core.messages import translate
 from servoscope.report.format_values import DASH, format_duration, plain_name
 from servoscope.report.page import say
 from servoscope.service.store.queries import format_time
@@ -44,60 +45,40 @@ def asset_table(statuses: Mapping[str, Mapping[str, Any]], width: int) -> Table:
     followed = {name: row for name, row in statuses.items() if not row["status"].get("service")}
     frequencies = sorted({f for row in followed.values() for f, *_ in row["status"].get("residual", ())})
     wide = width >= MIN_COLUMNS_OF_WIDE_TABLE + 9 * len(frequencies)
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("asset", "verdict", "since (UTC)", *(("T²/limit", "test") if wide else ())):
-        table.add_column(name, justify="right" if name in ("T²/limit", "test") else "left", no_wrap=True)
-    for f in frequencies:
-        table.add_column(f"γ {f:g} Hz", justify="right", no_wrap=True)
-    table.add_column("alarms", overflow="fold")
-    for name in ("NE 107", "last sample", "stored") if wide else ():
-        table.add_column(name, no_wrap=True)
-    now = time.time()
+    tests, more = (("T²/limit", "test"), ("NE 107", "last sample", "stored")) if wide else ((), ())
+    head = ("asset", "verdict", "since", *tests, *(f"γ {f:g} Hz" for f in frequencies), "alarms", *more)
+    rows, now = [], time.time()
     for name, row in followed.items():
         status = row["status"]
         residual = {f: (real, imaginary, healthy) for f, real, imaginary, healthy in status.get("residual", ())}
-        tests = _format_number(status.get("statistic")), _format_number(status.get("level"))
-        ne107 = Text(plain_name(status["ne107"]), NE107.get(status["ne107"], ""))
-        more = (
-            ne107,
-            format_timestamp(status["counted"]["t"]),
-            f"{format_duration(round(max(0.0, now - row['at']), 1))} ago",
-        )
-        table.add_row(
-            name,
-            Text(status["verdict"], COLOURS.get(status["verdict"], "")),
+        ne107 = Text(translate(plain_name(status["ne107"])), NE107.get(status["ne107"], ""))
+        age = format_duration(round(max(0.0, now - row["at"]), 1))
+        cells = (
+            Text(name),
+            Text(translate(status["verdict"]), COLOURS.get(status["verdict"], "")),
             format_timestamp(status["since"]),
-            *(tests if wide else ()),
+            *((_format_number(status.get("statistic")), _format_number(status.get("level"))) if wide else ()),
             *(format_relative_residual(residual.get(f)) for f in frequencies),
             format_alarms(status["alarms"]),
-            *(more if wide else ()),
+            *((ne107, format_timestamp(status["counted"]["t"]), say("cli.ago", duration=age)) if wide else ()),
         )
-    return table
+        rows.append(cells)
+    return build_table(head, rows)
 
 
 def commissioning_table(rows: Sequence[CommissioningRow]) -> Table:
     """Return how assets are heard, for somebody who has just connected them."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("asset", "source", "heard", "blocks", "Hz", "needed"):
-        table.add_column(name, justify="right" if name in ("blocks", "Hz", "needed") else "left", no_wrap=True)
-    table.add_column("newest sample", no_wrap=True)
-    table.add_column("what is wrong", overflow="fold")
+    shown = []
     for row in rows:
         state, age = row.reception.state, row.age_s
-        when = DASH
-        if not math.isnan(age):
-            when = say("cli.ago" if age >= 0.0 else "cli.ahead", duration=format_duration(round(abs(age), 1)))
-        table.add_row(
-            row.asset,
-            row.source,
-            Text(state, "green" if state == "followed" else "red"),
-            str(row.blocks),
-            DASH if math.isnan(row.rate_hz) else f"{row.rate_hz:.4g}",
-            f"{row.needed_hz:.4g}",
-            when,
-            row.reception.why or DASH,
+        key = "cli.ago" if age >= 0.0 else "cli.ahead"
+        when = DASH if math.isnan(age) else say(key, duration=format_duration(round(abs(age), 1)))
+        rates = DASH if math.isnan(row.rate_hz) else f"{row.rate_hz:.4g}", f"{row.needed_hz:.4g}"
+        heard = Text(translate(plain_name(state)), "green" if state == "followed" else "red")
+        shown.append(
+            (Text(row.asset), Text(row.source), heard, str(row.blocks), *rates, when, row.reception.why or DASH)
         )
-    return table
+    return build_table(("asset", "source", "heard", "blocks", "Hz", "needed", "newest sample", "what is wrong"), shown)
 
 
 def service_lines(statuses: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -108,7 +89,7 @@ def service_lines(statuses: Mapping[str, Mapping[str, Any]]) -> list[str]:
             flood, alarms = row["status"]["flood"], format_alarms(row["status"]["alarms"])
             parts = [alarms] if alarms != DASH else []
             if flood["since"] is not None:
-                parts.append(f"flood since {format_timestamp(flood['since'])}, {flood['held']} held")
+                parts.append(say("cli.flood", since=format_timestamp(flood["since"]), held=flood["held"]))
             lines += [f"{name}: {', '.join(parts)}"] if parts else []
     return lines
 
@@ -134,8 +115,8 @@ def status_page(statuses: Mapping[str, Mapping[str, Any]], width: int) -> Group:
 
 def format_alarms(alarms: Mapping[str, Mapping[str, Any]]) -> str:
     """Return the alarms that are not normal."""
-    active = [f"{name} {plain_name(one['state'])}" for name, one in alarms.items() if one["state"] != "normal"]
-    return ", ".join(active) or DASH
+    states = {name: one["state"] for name, one in alarms.items() if one["state"] != "normal"}
+    return ", ".join(f"{translate(name)} {translate(plain_name(state))}" for name, state in states.items()) or DASH
 
 
 def format_relative_residual(residual: Sequence[float | None] | None) -> str:
@@ -158,14 +139,9 @@ def active_alarms(statuses: Mapping[str, Mapping[str, Any]]) -> list[dict[str, A
 
 def row_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> Table:
     """Return a table of some columns of rows; times as dates."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in columns:
-        table.add_column(plain_name(name), overflow="fold", no_wrap=name in (*TIME_COLUMNS, "asset"))
-    for row in rows:
-        table.add_row(
-            *(_format_cell(name, _delivery_subject(row) if name == "subject" else row.get(name)) for name in columns)
-        )
-    return table
+    subjects = ({**row, "subject": _delivery_subject(row)} if "subject" in columns else row for row in rows)
+    cells = [[_format_cell(name, row.get(name)) for name in columns] for row in subjects]
+    return build_table([plain_name(name) for name in columns], cells)
 
 
 def _delivery_subject(row: Mapping[str, Any]) -> str:
@@ -188,6 +164,6 @@ def _format_cell(name: str, value: Any) -> str:
         return str(value) if len(value) <= OUTCOME else f"{value[: OUTCOME - 3]}..."
     if isinstance(value, Mapping):
         return ", ".join(f"{plain_name(key)}: {_format_cell(key, one)}" for key, one in value.items() if one != "")
-    if name in ("state", "after", "what"):
-        return plain_name(str(value))
+    if name in ("state", "after", "what", "verdict", "priority", "grounds"):
+        return translate(plain_name(str(value)))
     return _format_number(value) if isinstance(value, float) else str(value)

@@ -68,14 +68,19 @@ def print_title(out: Console, name: str, text: str) -> None:
     out.print(Text.assemble((name, "bold"), text))
 
 
-def print_table(out: Console, header: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1) -> None:
-    """Print a table whose first `words` columns are text and whose others are numbers."""
+def build_table(header: Sequence[str], rows: Iterable[Sequence[str | Text]], words: int | None = None) -> Table:
+    """Return a table whose first `words` columns, None: all, are text and whose others are numbers."""
     grid = Table(box=None, padding=(0, 2, 0, 0), header_style="dim", show_edge=False)
     for i, name in enumerate(header):
-        grid.add_column(translate(name), justify="left" if i < words else "right", overflow="fold")
+        grid.add_column(translate(name), justify="left" if words is None or i < words else "right", overflow="fold")
     for row in rows:
-        grid.add_row(*(Text(translate_range(cell)) for cell in row))
-    out.print(Padding(grid, INDENT, expand=False))
+        grid.add_row(*(Text(translate_range(cell)) if isinstance(cell, str) else cell for cell in row))
+    return grid
+
+
+def print_table(out: Console, header: Sequence[str], rows: Iterable[Sequence[str | Text]], words: int = 1) -> None:
+    """Print a table as `build_table` returns it."""
+    out.print(Padding(build_table(header, rows, words), INDENT, expand=False))
 
 
 def print_result_table(out: Console, table: ResultTable) -> None:

@@ -1,0 +1,109 @@
+"""How long pages of 50 assets with a year of sizes take: each answer of the server, and a browser to its first chart.
+
+    python benchmarks/web/first_chart.py [--assets 50] [--looks 10] [--json]
+
+The store is that of years.py. All that the page of an asset asks for is asked for once for each asset, and the fleet
+and the alarms as often; then a browser opens the pages of some of the assets, each with an empty cache. A chart is
+there when a canvas has something in it. Times are as a reader waits; the processor time of the server tells
+more on a busy machine.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+BENCHMARKS = Path(__file__).resolve().parent.parent
+sys.path[0] = str(BENCHMARKS)  # where `web` is a package, and `tables` lies
+
+import httpx  # noqa: E402
+import numpy as np  # noqa: E402
+from playwright.sync_api import sync_playwright  # noqa: E402
+from tables import Table, parser, show  # noqa: E402
+
+from web import store  # noqa: E402
+from web.load import SOURCE, usage  # noqa: E402
+from web.years import PAGE, fill  # noqa: E402
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+DRAWN = """() => [...document.querySelectorAll("canvas")].some((c) => c.width && c.height
+  && c.getContext("2d").getImageData(0, 0, c.width, c.height).data.some(Boolean))"""
+
+
+def answers(client: httpx.Client, pid: int, assets: int) -> tuple[list[float], list[float]]:
+    """Return how long each answer took, and the processor time of all answers for each asset [s]."""
+    waits, used = [], []
+    for number in range(assets):
+        before = usage(pid)[0]
+        own = [f"/assets/axis-{number:03d}{path}" for path in (*PAGE, "/trend?limit=2", "/notes", "/limits")]
+        for path in (*own, "/assets", "/alarms"):
+            start = time.perf_counter()
+            client.get(f"/api/v1{path}").raise_for_status()
+            waits.append(time.perf_counter() - start)
+        used.append(usage(pid)[0] - before)
+    return waits, used
+
+
+def first_charts(address: str, looks: int) -> list[float]:
+    """Return how long a browser takes from the address to the first chart on the pages of some assets [s]."""
+    found = next(filter(None, map(shutil.which, BROWSERS)))
+    waits = []
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=found, args=["--no-sandbox", "--disable-dev-shm-usage"])
+        for number in range(looks):
+            context = browser.new_context(viewport={"width": 1366, "height": 768})
+            page = context.new_page()
+            start = time.perf_counter()
+            page.goto(f"{address}/assets/axis-{number:03d}", wait_until="commit")
+            page.wait_for_function(DRAWN, timeout=120000)
+            waits.append(time.perf_counter() - start)
+            context.close()
+        browser.close()
+    return waits
+
+
+def main() -> None:
+    """Fill a store, serve it, ask, look, print."""
+    command = parser(__doc__)
+    command.add_argument("--assets", type=int, default=50)
+    command.add_argument("--looks", type=int, default=10)
+    given = command.parse_args()
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        fill(folder, given.assets)
+        two = (folder / "two.toml").read_text(encoding="utf-8")
+        (folder / "hall.toml").write_text(two.replace("two.sqlite", store.FILE), encoding="utf-8")
+        serve = [sys.executable, "-m", "servoscope", "serve", "hall.toml", "--listen", "127.0.0.1:0"]
+        environment = {**os.environ, "PYTHONPATH": str(SOURCE)}
+        server = subprocess.Popen(serve, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True)
+        stack.callback(lambda: (server.terminate(), server.wait(30)))
+        assert server.stderr is not None
+        address = next(found[1] for line in server.stderr if (found := re.match(r"servoscope: (https?://\S+)/ ", line)))
+        client = stack.enter_context(httpx.Client(base_url=address, timeout=60.0))
+        answers(client, server.pid, 1)  # what the first one imports
+        waits, used = answers(client, server.pid, given.assets)
+        first_charts(address, 1)  # the browser's own start
+        charts = first_charts(address, given.looks)
+    spread = "{:.2f} s, {:.2f} s, {:.2f} s"
+    of = lambda values: spread.format(*np.quantile(values, (0.5, 0.95, 1.0)))  # noqa: E731
+    rows = (
+        (f"{len(waits)} answers of the server", of(waits)),
+        (f"{given.looks} pages in a browser, to the first chart", of(charts)),
+        ("processor time of the server for all that the page of an asset asks for", of(used)),
+    )
+    note = (
+        f"{given.assets} assets with a year of a leak and four coefficients; a machine with a load of "
+        f"{os.getloadavg()[0]:.1f}. Median, 95 % and largest."
+    )
+    show([Table("Pages of a year", note, ("what", "value"), rows)], given.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,41 @@
+"""Reports on a phone, in a real browser: nothing but pictures and tables scrolls sideways."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import servoscope as ss
+from golden.results import FOLDER
+from servoscope.assessment import assess
+from servoscope.learning.inspection import inspect
+from servoscope.report.assessment_page import write_assessment_page
+from servoscope.report.inspection_page import write_inspection_page
+
+pytestmark = pytest.mark.slow
+
+WIDTH = 390
+BEYOND = f"""() => [...document.querySelectorAll("h1, h2, p, li, dt, dd, header")].filter(
+  (one) => !one.closest(".scroll, figure") && one.getBoundingClientRect().right > {WIDTH}).map((one) => one.textContent)"""
+
+
+def test_reports_are_read_at_the_width_of_a_phone(chromium: Any, tmp_path: Path) -> None:
+    baseline = ss.Baseline.load(FOLDER / "rig.json")
+    recording = ss.read(FOLDER / "suspect.parquet", baseline.loop)
+    ss.write_report(tmp_path / "diagnosis.html", baseline, recording)
+    write_inspection_page(tmp_path / "inspection.html", inspect(recording, baseline.loop), recording)
+    t = np.arange(0.0, 60.0, 0.1)
+    log = {"t": t, "r": np.ones_like(t), "u": 0.5 - 0.1 * np.sin(t), "y": 1.0 + 0.1 * np.sin(t)}
+    write_assessment_page(tmp_path / "assessment.html", assess(log, name=f"{'long' * 20}.csv"))
+    page = chromium.new_page(viewport={"width": WIDTH, "height": 844})
+    for path in sorted(tmp_path.glob("*.html")):
+        page.goto(path.as_uri())
+        first = page.get_by_role("heading", level=1).bounding_box()
+        assert first["y"] + first["height"] < 844.0
+        page.evaluate("document.querySelectorAll('details').forEach((one) => (one.open = true))")
+        assert page.evaluate("document.documentElement.scrollWidth") <= WIDTH, path.name
+        assert page.evaluate(BEYOND) == []
+    page.close()
