@@ -19,7 +19,8 @@ pytestmark = pytest.mark.slow
 
 WIDTH = 390
 BEYOND = f"""() => [...document.querySelectorAll("h1, h2, p, li, dt, dd, header")].filter(
-  (one) => !one.closest(".scroll, figure") && one.getBoundingClientRect().right > {WIDTH}).map((one) => one.textContent)"""
+  (one) => !one.closest(".scroll, figure") && one.getBoundingClientRect().right > {WIDTH}
+).map((one) => one.textContent)"""
 
 
 def test_reports_are_read_at_the_width_of_a_phone(chromium: Any, tmp_path: Path) -> None:
