@@ -9,6 +9,7 @@ import json
 import math
 from collections.abc import Sequence
 from importlib.resources import files
+from itertools import chain, repeat
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ from servoscope.signals.readers.formats import open_file
 from servoscope.signals.readers.guess_columns import guess_mapping
 from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD
 from servoscope.web.downsample import downsample_indices, json_numbers, signal_columns
-from servoscope.web.schemas import requests, responses
+from servoscope.web.schemas import requests
 from servoscope.web.schemas.responses import JsonObject
 
 PREVIEW_ROWS = 20
@@ -62,15 +63,14 @@ def preview_file(progress: Progress, file: str) -> JsonObject:
         first = first if first is not None else table
     assert first is not None, "a file without rows was refused"
     head = [[_preview_cell(x) for x in first.columns[name].slice(0, most).to_pylist()] for name in names]
-    preview = responses.TablePreview(columns=names, rows=[list(row) for row in zip(*head, strict=True)])
     signals = signal_names(listed)
-    return responses.FilePreview(
-        rows=count,
-        columns=channels,
-        preview=preview,
-        mapping=guess_mapping(signals),
-        axes={axis: guess_mapping(columns) for axis, columns in find_axes(signals).items()},
-    ).model_dump()
+    return {
+        "rows": count,
+        "columns": channels,
+        "preview": {"columns": names, "rows": list(zip(*head, strict=True))},
+        "mapping": guess_mapping(signals),
+        "axes": {axis: guess_mapping(columns) for axis, columns in find_axes(signals).items()},
+    }
 
 
 def _check_width(file: str, names: Sequence[str]) -> None:
@@ -154,18 +154,16 @@ def diagnose_file(
     origin = plain_values.provenance(used, Path(name), Path(file))
     report.write_diagnosis_page(Path(out) / "report.html", diagnosis, trace, recording, used.loop, origin)
     plant = used.loop.plant
-    data = responses.DiagnosisData(
-        document=json.loads(diagnosis.model_dump_json()),
-        words={fault.name: fault.words for fault in plant.all_faults},
-        units=list(plant.units),
-        signals=responses.SignalColumns(**_recording_columns(recording)),
-        trace=_trace_columns(trace, plant.coefficient_units),
-        signature=[
-            responses.SignatureColumns.model_validate(one)
-            for one in signature_columns(recording, used.loop, diagnosis.onset_s[1] if diagnosis.onset_s else None)
-        ],
-    )
-    (Path(out) / "data.json").write_text(data.model_dump_json(), encoding="utf-8")
+    data = {
+        "document": diagnosis.model_dump(mode="json"),
+        "words": {fault.name: fault.words for fault in plant.all_faults},
+        "units": plant.units,
+        "signals": _recording_columns(recording),
+        "trace": _trace_columns(trace, plant.coefficient_units),
+        "signature": signature_columns(recording, used.loop, diagnosis.onset_s[1] if diagnosis.onset_s else None),
+    }
+    text = json.dumps(plain_values.replace_nan(data), allow_nan=False)
+    (Path(out) / "data.json").write_text(text, encoding="utf-8")
     kept = {"verdict": diagnosis.verdict, "summary": str(diagnosis.summary), "recording": diagnosis.recording}
     return {**kept, "hash": used.hash}
 
@@ -292,30 +290,24 @@ def _recording_columns(recording: Recording) -> dict[str, list[float | None]]:
     return signal_columns(recording.t, (recording.r, recording.u, recording.y), SIGNAL_POINTS)
 
 
-def _trace_columns(trace: Trace, units: Sequence[str]) -> responses.TraceColumns:
+def _trace_columns(trace: Trace, units: Sequence[str]) -> JsonObject:
+    """Return the evaluations as columns: tests, iFRF and coefficients, each beside what is healthy."""
     excess = np.where(trace.ready, trace.statistic / trace.threshold, np.nan)
     at = downsample_indices((excess, trace.level), TRACE_POINTS)
     std = np.sqrt(np.maximum(np.diagonal(trace.covariance, axis1=1, axis2=2), 0.0))
     rows = response_rows(trace.ifrf, trace.ifrf_expected, at)
-    return responses.TraceColumns(
-        t=json_numbers(trace.t[at]),
-        statistic=json_numbers(excess[at]),
-        level=json_numbers(trace.level[at]),
-        responses=[
-            responses.TraceResponse(
-                frequency_hz=float(f),
-                **{name: json_numbers(rows[:, i, k + 1]) for k, name in enumerate(ResponseRow._fields[1:5])},
-            )
-            for i, f in enumerate(trace.ifrf.frequencies)
-        ],
-        parameters=[
-            responses.TraceParameter(
-                name=name,
-                unit=units[i] if i < len(units) else "",
-                value=json_numbers(trace.theta[at, i]),
-                std=json_numbers(std[at, i]),
-                nominal=json_numbers(trace.expected[at, i]),
-            )
-            for i, name in enumerate(trace.names)
-        ],
-    )
+    tests = {"t": trace.t, "statistic": excess, "level": trace.level}
+    coefficients = {"value": trace.theta, "std": std, "nominal": trace.expected}
+    responses = [
+        {
+            "frequency_hz": f,
+            **{name: json_numbers(rows[:, i, k + 1]) for k, name in enumerate(ResponseRow._fields[1:5])},
+        }
+        for i, f in enumerate(trace.ifrf.frequencies.tolist())
+    ]
+    parameters = [
+        {"name": name, "unit": unit, **{key: json_numbers(each[at, i]) for key, each in coefficients.items()}}
+        for i, (name, unit) in enumerate(zip(trace.names, chain(units, repeat("")), strict=False))
+    ]
+    columns = {key: json_numbers(each[at]) for key, each in tests.items()}
+    return {**columns, "responses": responses, "parameters": parameters}

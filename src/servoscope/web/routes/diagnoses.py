@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from functools import partial
 from typing import Annotated, Any
 
@@ -137,20 +138,20 @@ def _asset_context(
 def _upload_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
     record = context.storage.read(responses.UploadDiagnosis, id_.removeprefix(UPLOAD_PREFIX))
     path = context.storage.path(responses.UploadDiagnosis, record.id) / "data.json"
-    data = responses.DiagnosisData.model_validate_json(path.read_bytes())
-    coefficients = {one.name: one.unit for one in data.trace.parameters}
-    y, u = data.units
-    known = DiagnosisContext(words=data.words, units=(y, u), coefficient_units=coefficients)
+    data = json.loads(path.read_bytes())
+    coefficients = {one["name"]: one["unit"] for one in data["trace"]["parameters"]}
+    y, u = data["units"]
+    known = DiagnosisContext(words=data["words"], units=(y, u), coefficient_units=coefficients)
     return responses.DiagnosisDetail(
         **dict(_upload_row(record)),
-        document=data.document,
-        sections=to_json(diagnosis_document(Diagnosis.model_validate(data.document), known)),
+        document=data["document"],
+        sections=to_json(diagnosis_document(Diagnosis.model_validate(data["document"]), known)),
         who=record.who,
         baseline=record.baseline,
-        units=signal_units(data.units),
-        signals=data.signals,
-        trace=data.trace,
-        signature=data.signature,
+        units=signal_units(data["units"]),
+        signals=data["signals"],
+        trace=data["trace"],
+        signature=data.get("signature", []),  # of earlier versions
         report=f"{API}/diagnoses/{id_}/report",
         upload=record.upload,
     )

@@ -18,7 +18,7 @@ from servoscope.service.actions.settings import (
 from servoscope.service.store.queries import query_history
 from servoscope.service.store.rows import TEST
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Engineer
-from servoscope.web.schemas.notifications import LastDelivery, NotificationOutlet, NotificationOutlets
+from servoscope.web.schemas.notifications import NotificationOutlet, NotificationOutlets
 
 router = APIRouter(tags=["alarms"], dependencies=[VIEWER])
 
@@ -41,12 +41,14 @@ def _outlets(context: Context) -> dict[str, NotificationOutlet]:
     if context.config is None:
         return {}
     settings = context.config.actions
-    last = {row["sink"]: row for row in query_history(context.store, "deliveries", last=DELIVERIES)}
     newest = {
-        name: LastDelivery(
-            t=row["created"], event=row["event"]["event"], **{key: row[key] for key in ("attempts", "outcome")}
-        )
-        for name, row in last.items()
+        row["sink"]: {
+            "t": row["created"],
+            "event": row["event"]["event"],
+            "attempts": row["attempts"],
+            "outcome": row["outcome"],
+        }
+        for row in query_history(context.store, "deliveries", last=DELIVERIES)
     }
     return {
         name: NotificationOutlet(

@@ -2,16 +2,7 @@
 
 from __future__ import annotations
 
-from servoscope.web.schemas.responses import ApiResponse
-
-
-class LastDelivery(ApiResponse):
-    """The newest notification for an outlet; `outcome` is empty before its first attempt."""
-
-    t: float
-    event: str
-    attempts: int
-    outcome: str
+from servoscope.web.schemas.responses import ApiResponse, JsonObject
 
 
 class NotificationOutlet(ApiResponse):
@@ -21,7 +12,7 @@ class NotificationOutlet(ApiResponse):
     kind: str  # webhook, command, mqtt or email
     target: str
     may_test: bool  # not what changes a machine
-    last: LastDelivery | None
+    last: JsonObject | None  # newest notification: t, event, attempts, and outcome, empty before the first attempt
 
 
 class NotificationOutlets(ApiResponse):

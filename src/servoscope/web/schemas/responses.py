@@ -134,60 +134,6 @@ class SignalColumns(ApiResponse):
     y: NullableFloats
 
 
-class TraceResponse(ApiResponse):
-    """The iFRF at one frequency over time, and the healthy one."""
-
-    frequency_hz: float
-    real: NullableFloats
-    imag: NullableFloats
-    nominal_real: NullableFloats
-    nominal_imag: NullableFloats
-
-
-class TraceParameter(ApiResponse):
-    """A coefficient over time, its standard deviation, and the healthy value."""
-
-    name: str
-    unit: str
-    value: NullableFloats
-    std: NullableFloats
-    nominal: NullableFloats
-
-
-class TraceColumns(ApiResponse):
-    """The evaluations of a recording as columns."""
-
-    t: NullableFloats
-    statistic: NullableFloats
-    level: NullableFloats
-    responses: list[TraceResponse]
-    parameters: list[TraceParameter]
-
-
-class SignatureColumns(ApiResponse):
-    """Mean u over position, forward and backward, and over speed; null where nothing was measured."""
-
-    words: str
-    position: list[float | None]
-    forward: list[float | None]
-    backward: list[float | None]
-    speed: list[float | None]
-    by_speed: list[float | None]
-    friction_band: list[float] | None = None  # twice the dry friction, and its standard deviation
-    lost_motion: list[float] | None = None
-
-
-class DiagnosisData(ApiResponse):
-    """The data of a diagnosis of an upload, as its job writes them."""
-
-    document: JsonObject
-    words: dict[str, str]
-    units: list[str]  # of y and u
-    signals: SignalColumns
-    trace: TraceColumns
-    signature: list[SignatureColumns] = []
-
-
 class BaselineRef(ApiResponse):
     """The baseline of a diagnosis."""
 
@@ -243,9 +189,9 @@ class DiagnosisDetail(DiagnosisRow):
     who: str | None = None
     baseline: BaselineRef | None
     units: dict[str, str] | None
-    signals: SignalColumns | None = None
-    trace: TraceColumns | None = None
-    signature: list[SignatureColumns] = []
+    signals: JsonObject | None = None
+    trace: JsonObject | None = None
+    signature: list[JsonObject] = []
     report: str | None = None
     upload: str | None = None
 
