@@ -39,6 +39,7 @@ class StoredDiagnosis(BaseModel):
     document: dict[str, Any] = {}  # of a diagnosis: as `diagnose --json` prints it
     # whether an alarm has gone that is still in the window: until it has left it, the window proves nothing
     recovering: bool = False
+    control: str | None = None  # the nearly certain cause of poor control, "" for none; None: not assessed
     size: FaultEstimate | None = None  # of the fault that was named before, as it is now; None: not known
 
     @property
@@ -126,6 +127,20 @@ def examine_blocks(
     headline = message("service.examination.fault")
     size = _follow_size(exam, fault, first) if fault is not None else None
     return StoredDiagnosis(verdict="fault", headline=headline, onset=onset, size=size)
+
+
+def assess_blocks(baseline: Baseline, name: str, blocks: Sequence[Block]) -> str | None:
+    """Return the cause of poor control that the last minutes show with near certainty, "" if none.
+
+    None where the samples cannot be used, or do not suffice.
+    """
+    from servoscope.assessment.assess import assess
+
+    try:
+        assessment = assess(blocks_to_recording(baseline, name, blocks)[0])
+    except ServoscopeError:
+        return None
+    return assessment.alarming_cause or (None if assessment.verdict == "cannot tell" else "")
 
 
 def compile_examination(baseline: Baseline) -> None:
