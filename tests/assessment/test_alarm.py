@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import halls
 import numpy as np
+from test_assess import N, loop
 
 from servoscope.core.messages import speak
 from servoscope.diagnosis.monitor import Monitor
@@ -14,7 +15,6 @@ from servoscope.service.assets.checkpoint import pack_state, unpack_state
 from servoscope.service.config import DiagnosisSettings
 from servoscope.service.sources.block import Block
 from servoscope.signals.quality import QualitySettings
-from test_assess import N, loop
 
 BEGAN = 1767225600.0
 ALARMS = AlarmSettings.model_validate({"control": {"source": "control", "operator_action": "test the valve"}})
