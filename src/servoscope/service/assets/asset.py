@@ -21,7 +21,7 @@ from servoscope.service.alarms import AlarmSettings, AlarmTransition, OperatorCo
 from servoscope.service.assets.alarms import AssetAlarms
 from servoscope.service.assets.block_lanes import BlockLanes, Followed
 from servoscope.service.assets.checkpoint import AssetState, StreamPosition, evolve
-from servoscope.service.assets.examination import StoredDiagnosis, assess_blocks, carry_covariates, examine_blocks
+from servoscope.service.assets.examination import StoredDiagnosis, carry_covariates, examine_blocks
 from servoscope.service.assets.examination_schedule import (
     ExaminationState,
     PendingDiagnosis,
@@ -362,7 +362,7 @@ class Asset(StateHolder):
         """Examine the last minutes if that is due, and request a full diagnosis of a new fault."""
         state, settings = self.take_state(), self.policy.diagnosis
         t, known = state.position.t, state.examination
-        details = state.evaluation.features, single_fault(known.faults), known.verdict
+        details = state.evaluation.features, single_fault(known.faults), known.verdict, self._alarms.assesses
         if is_at_rest(known, t, state.evaluation.exceeded):
             return
         recent = partial(self._window.after, t - settings.window_s)
@@ -371,7 +371,7 @@ class Asset(StateHolder):
             settings,
             t,
             state.evaluation.exceeded,
-            lambda: self._examine_blocks(recent(), *details),
+            lambda: examine_blocks(self.baseline, self.name, self._carry_covariates(recent()), *details),
             self._phase,
             sound=quality.limit_verdict("fault", quality.active_findings(state.quality)) == "fault",
         )
@@ -388,13 +388,6 @@ class Asset(StateHolder):
             window = PendingDiagnosis(self._next_row_number(), recent()[0].sequence, self._schedule.end(t), "full")
             pending = (*self.take_state().pending_diagnoses, window)
             self.state = replace(self.take_state(), examination=examination, pending_diagnoses=pending)
-
-    def _examine_blocks(self, blocks: Sequence[Block], *details: Any) -> StoredDiagnosis:
-        blocks = self._carry_covariates(blocks)
-        result = examine_blocks(self.baseline, self.name, blocks, *details)
-        if not self._alarms.assesses:
-            return result
-        return result.model_copy(update={"control": assess_blocks(self.baseline, self.name, blocks)})
 
     def _advance_alarms(self, t: float) -> None:
         """Update the alarms at time `t` [UTC s]."""
