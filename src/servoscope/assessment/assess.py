@@ -72,7 +72,7 @@ class Assessment(ShortRepr, BaseModel):
     Examples
     --------
     >>> ss.assess("friday.csv").verdict
-    'too tight'
+    'good'
     """
 
     model_config = ConfigDict(frozen=True)
