@@ -71,7 +71,7 @@ def test_of_long_recordings_stretches_are_learned_and_the_whole_is_judged(
     learned = operating_points.learn(loop, day)
     assert learned.sources[0].samples == 20_000
     (note,) = [str(note) for note in learned.notes if "evenly spread" in str(note)]
-    assert "learned from 20000 of its 60000 rows" in note and "Healthy" in note
+    assert "learned from 20000 of 60000 rows" in note and "Healthy" in note
     worn = record(loop, seconds=600.0, faults=[FaultEvent("C_ie", 1.3, 300.0)])
     assert diagnose(learned, worn).faults[0].ratio == pytest.approx(1.3, rel=0.05)
     stretches = thin_out(day, 20_000, 5000)
