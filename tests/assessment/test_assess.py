@@ -16,6 +16,8 @@ from servoscope.assessment.plant_loops import group_by_period, rank
 from servoscope.assessment.tags import find_loops
 from servoscope.cli import app
 from servoscope.core.messages import speak
+from servoscope.learning.learn import doubt_healthy
+from servoscope.signals import clean
 
 N = 1200
 T = np.arange(N) * 10.0
@@ -123,7 +125,7 @@ def test_loops_with_one_period_are_grouped_with_the_likeliest_source_first() -> 
 
 
 def test_the_command_ranks_an_export_and_writes_pages_and_a_work_list(tmp_path: Path) -> None:
-    sticks, good = loop(7, stick=4.0), loop(8)
+    sticks, good = loop(13, stick=4.0), loop(5)
     names = {"r": "SP", "u": "OP", "y": "PV"}
     columns = {"t": T}
     for tag, log in (("FIC1", sticks), ("FIC2", good)):
@@ -163,3 +165,18 @@ def test_process_loops_are_judged(shared_data: Path) -> None:
     for name in files[:2]:
         result = ss.assess(folder / name)
         assert result.probabilities["stiction"] + result.probabilities["backlash"] > 0.3, name
+
+
+def test_a_sticking_valve_is_no_healthy_recording_to_learn_from() -> None:
+    log, good = loop(13, stick=2.0), loop(3)
+    doubt = doubt_healthy(recorded(log, "monday.csv"))
+    assert doubt is not None
+    assert "monday.csv" in str(doubt)
+    with speak("de"):
+        assert "Haftreibung" in str(doubt)
+    assert doubt_healthy(recorded(good, "friday.csv")) is None
+
+
+def recorded(log: dict[str, np.ndarray], name: str) -> ss.Recording:
+    t, r, u, y = (log[key] for key in ("t", "r", "u", "y"))
+    return clean(t, r, u, y, name=name, sample_rate=0.1)

@@ -17,7 +17,7 @@ from rich.console import Console
 import servoscope as ss
 from golden.results import FOLDER
 from servoscope import report
-from servoscope.assessment import assess
+from servoscope.assessment.assess import assess
 from servoscope.cli.render import history, results
 from servoscope.cli.render.assessment import print_assessment
 from servoscope.cli.render.diagnosis import print_diagnosis

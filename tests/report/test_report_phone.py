@@ -10,7 +10,7 @@ import pytest
 
 import servoscope as ss
 from golden.results import FOLDER
-from servoscope.assessment import assess
+from servoscope.assessment.assess import assess
 from servoscope.learning.inspection import inspect
 from servoscope.report.assessment_page import write_assessment_page
 from servoscope.report.inspection_page import write_inspection_page

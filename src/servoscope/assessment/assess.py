@@ -10,8 +10,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, PrivateAttr
 
 from servoscope.assessment import indices
+from servoscope.assessment.causes import CAUSES, MIN_ALARM_PROBABILITY, POOR_CONTROL, Cause
 from servoscope.assessment.features import Analysis, analyse
-from servoscope.assessment.posterior import CAUSES, Cause, load_posterior
+from servoscope.assessment.posterior import load_posterior
 from servoscope.assessment.tags import find_loops
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import RecordingError
@@ -71,7 +72,7 @@ class Assessment(ShortRepr, BaseModel):
     Examples
     --------
     >>> ss.assess("friday.csv").verdict
-    'too tight'
+    'good'
     """
 
     model_config = ConfigDict(frozen=True)
@@ -101,6 +102,11 @@ class Assessment(ShortRepr, BaseModel):
     def signals(self) -> AssessedSignals | None:
         """What figures are drawn from; None when the assessment was read back from JSON."""
         return self._signals
+
+    @property
+    def alarming_cause(self) -> Cause | None:
+        """The cause, where it is one of poor control and nearly certain."""
+        return self.verdict if self.verdict in POOR_CONTROL and self.probability >= MIN_ALARM_PROBABILITY else None
 
     @property
     def oscillates(self) -> bool:

@@ -18,7 +18,7 @@ from servoscope.cli.output_paths import REPORTS, OutputPaths, check_output
 from servoscope.cli.progress import show_steps
 
 if TYPE_CHECKING:
-    from servoscope.assessment import Assessment
+    from servoscope.assessment.assess import Assessment
     from servoscope.signals.samples import Samples
 
 
@@ -43,8 +43,8 @@ def assess(
     check_output(work_list, "--csv", (".csv",), logs)
     limits = arguments.parse_range(travel, "--travel")
 
-    from servoscope.assessment import assess as assess_log
     from servoscope.assessment import plant_loops
+    from servoscope.assessment.assess import assess as assess_log
     from servoscope.cli.render import assessment, results
     from servoscope.core.files import atomic_write
     from servoscope.report import assessment_page
