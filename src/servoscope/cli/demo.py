@@ -15,6 +15,7 @@ from rich.text import Text
 
 from servoscope.core.files import atomic_write, make_folder
 
+WIDTH = 80
 COEFFICIENTS = (
     "theta_0 ... theta_3 are the coefficients of s^0 ... s^3 of the inverse: the current u (A) that the "
     "position y (m) and its three derivatives ask for, in A/m, A s/m, A s²/m and A s³/m."
@@ -87,8 +88,7 @@ def run_demo(folder: Path, run: Callable[[Sequence[str]], object]) -> None:
     out = results.create_console()
     for step in demo_steps(folder):
         out.print(Text(step.purpose, style="bold"))
-        to = f" > {shlex.quote(str(step.output))}" if step.output is not None else ""
-        out.print(Text(f"$ {shlex.join(('servoscope', *step.arguments))}{to}", style="cyan"), soft_wrap=True)
+        out.print(Text(_format_command(step), style="cyan"), soft_wrap=True)
         if step.output is None:
             _exit_on_failure(run(step.arguments))
         else:
@@ -104,6 +104,22 @@ def run_demo(folder: Path, run: Callable[[Sequence[str]], object]) -> None:
         Text(f"Open {folder / 'report.html'} in a browser; {folder / 'loop.toml'} describes the rig."),
         soft_wrap=True,
     )
+
+
+def _format_command(step: DemoStep) -> str:
+    """Return the command as one would type it, broken where it is too long for a line."""
+    words = [shlex.quote(word) for word in ("servoscope", *step.arguments)]
+    if step.output is not None:
+        words.append(f"> {shlex.quote(str(step.output))}")
+    lines = ["$"]
+    for i, word in enumerate(words):
+        value = i + 1 < len(words) and word.startswith("-") and not words[i + 1].startswith(("-", ">"))
+        needed = len(f"{word} {words[i + 1]}") if value else len(word)  # an option stays with its value
+        if len(lines[-1]) + needed + 3 > WIDTH and len(lines[-1].split()) > 1:
+            lines[-1] += " \\"
+            lines.append("   ")
+        lines[-1] += f" {word}"
+    return "\n".join(lines)
 
 
 def _exit_on_failure(code: object) -> None:
