@@ -79,6 +79,18 @@ def test_a_missing_reference_and_gaps_do_not_stop_it() -> None:
     assert result.signals.t.size == 900  # the gap of two rows is filled, the one of a hundred cuts
 
 
+def test_rows_in_manual_mode_are_cut_out() -> None:
+    log = loop(5)
+    mode = np.where((np.arange(N) > 700) & (np.arange(N) < 900), 0.0, 1.0)
+    u = np.where(mode > 0.0, log["u"], 40.0)
+    result = ss.assess({**log, "u": u, "MODE": mode})
+    assert result.signals is not None
+    assert result.signals.t.size == 701
+    assert "mode" in find_loops(["Date", "FIC101.PV", "FIC101.OP", "FIC101.mode"])["FIC101"].segment[0]
+    words = {**log, "mode": np.where(mode > 0.0, "AUTO", "MAN")}
+    assert ss.assess(words).signals is not None
+
+
 def test_a_million_rows_are_thinned() -> None:
     rng = np.random.default_rng(6)
     u = np.cumsum(rng.standard_normal(1_000_000)) * 0.01
