@@ -35,6 +35,7 @@ def learn(
     accept_delay: bool = False,
     force: bool = False,
     population: Mapping[str, Baseline] | Sequence[Baseline | str | Path] = (),
+    earlier: Baseline | None = None,
 ) -> Baseline:
     """Learn a baseline from healthy recordings, at one operating point or at several.
 
@@ -67,6 +68,8 @@ def learn(
         Baselines of at least five like machines, or their paths, by name or in a list: how they differ is a prior, so
         that a new machine needs less healthy data of its own. A machine that is none of them is learned without; the
         notes say which it was.
+    earlier
+        What a baseline of more recordings, from before a repair, knows of how recordings of this machine scatter.
 
     Returns
     -------
@@ -113,7 +116,8 @@ def learn(
     for name, some in named.items():
         check_wraps(some)
         like = Population.from_baselines(_machines_at(alikes, name)) if alikes else None
-        one = learning.learn_baseline(loop, some, progress, accept_delay, like)
+        before = earlier.at(name) if earlier is not None and name in earlier.points else earlier
+        one = learning.learn_baseline(loop, some, progress, accept_delay, like, before)
         odd = check_plausibility(one, force or loop.implausible == "note")
         longest = max(some, key=lambda rec: rec.samples)
         progress("operating points")

@@ -112,7 +112,7 @@ def relearn(
         notes.setdefault(each.point, []).extend(message("learning.source_missing", recording=name) for name in missing)
     together = {each.point: [*kept.get(each.point, ()), *new.get(each.point, ())] for each in earlier.per_point}
     chosen = together.get("", together)
-    baseline = learn(loop, chosen, progress, accept_delay=accept_delay, force=force)
+    baseline = learn(loop, chosen, progress, accept_delay=accept_delay, force=force, earlier=earlier)
     number = max(history) + 1
     changed = any(note.key == "learning.accepted" for some in notes.values() for note in some)
     revision = Revision(

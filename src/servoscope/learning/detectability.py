@@ -36,9 +36,10 @@ def learn_detectability(
     paths: HealthyPaths,
     scatter: Scatter,
     covariance: FloatArray,
+    transient: FloatArray,
     thresholds: AlarmThresholds,
 ) -> tuple[Detectability, list[Message]]:
-    """Judge what coefficients with a covariance (n, n) can show, and note what limits it."""
+    """Judge what coefficients with a covariance (n, n), of which a part fades, can show, and note what limits it."""
     loop, fit, monitor = healthy.loop, plant.fit, healthy.loop.monitor
     notes = noise_notes(healthy.pipeline, fit, paths.estimates, can_simulate(loop))
     excess, suggestion = baseline_misfit(paths.estimates, paths.deviations, covariance, fit)
@@ -57,7 +58,7 @@ def learn_detectability(
     directions = fault_directions(loop, plant.plant, scatter.theta)
     changes, without_scatter = (
         detectable_changes(loop, directions, paths.estimates, C, thresholds.statistic)
-        for C in (covariance, scatter.theta_covariance + scatter.error)
+        for C in (covariance - np.diag(transient), scatter.theta_covariance + scatter.error)
     )
     smallest, fault = _smallest_change(changes)
     if smallest >= MIN_USELESS_CHANGE:

@@ -46,7 +46,7 @@ from servoscope.service.assets.records import (
     transition_row,
 )
 from servoscope.service.assets.states import AssetStates, RestPeriod, StateHolder
-from servoscope.service.assets.status import AssetStatus, asset_metadata, asset_status
+from servoscope.service.assets.status import MIN_LEARN_S, Announcement, AssetStatus, asset_metadata, asset_status
 from servoscope.service.config import DiagnosisSettings
 from servoscope.service.sources.block import Block
 from servoscope.service.store.bundles import pack_samples
@@ -111,6 +111,17 @@ class Asset(StateHolder):
             self.take_state()  # what its next block leads to is no longer what it was
         self._reception = reception
 
+    @property
+    def announced(self) -> Announcement | None:
+        """What was done to it, after which it learns again; None: nothing, or it has learned."""
+        return self._alarms.announced
+
+    @announced.setter
+    def announced(self, announced: Announcement | None) -> None:
+        if announced != self._alarms.announced and self._state is not None:
+            self.take_state()
+        self._alarms.announced = announced
+
     def compile_kernels(self) -> None:
         """Compile what blocks need, so that the first one does not wait for it."""
         nothing, monitor = np.full(2, np.nan), self.monitor
@@ -163,7 +174,9 @@ class Asset(StateHolder):
 
     def status(self, state: AssetState) -> AssetStatus:
         """Return what users see of a state."""
-        return asset_status(state, self._alarms.definitions, self._metadata, self.reception)
+        needed_s = min(MIN_LEARN_S, self.policy.diagnosis.kept_s)
+        about = self._alarms.definitions, self._metadata, self.reception
+        return asset_status(state, *about, self.announced, needed_s)
 
     def standing_alarms(self, state: AssetState) -> list[tuple[str, str, str]]:
         """Return name, priority and state of each alarm that is not normal."""

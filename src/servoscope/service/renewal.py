@@ -15,18 +15,16 @@ from servoscope.core.errors import BaselineError, RecordingError
 from servoscope.core.files import make_folder
 from servoscope.prognosis.series import NORMAL_95
 from servoscope.service.assets.examination import blocks_to_recording
-from servoscope.service.assets.status import AssetStatus
+from servoscope.service.assets.status import MIN_LEARN_S, AssetStatus
 from servoscope.service.config import ServiceFile
 from servoscope.service.sources.block import Block
 from servoscope.service.store import Store
-from servoscope.service.store.rows import NOTE, RELEARN
+from servoscope.service.store.rows import BASELINE_NOTE, CONFIRMATION, NOTE, RELEARN
 from servoscope.service.store.series import read_notes, read_series
 from servoscope.signals import Recording, readers
 from servoscope.signals.writers import plain_columns, write_recording
 
-MIN_LEARN_S = 600.0  # length of a stretch that is enough to learn from [s], unless fewer samples are kept
 JUDGED_AGAIN_S = 28 * 86400.0  # of past values that a preview judges again [s]
-BASELINE_NOTE = "baseline"  # kind of the note that a baseline was put in force
 
 
 class LearningProgress(NamedTuple):
@@ -53,7 +51,7 @@ def learning_progress(
 ) -> LearningProgress:
     """Return how far the learning of an asset is; `baseline`: the one in force."""
     revision = baseline.revision
-    notes = [note for note in read_notes(store, asset) if note.get("kind", NOTE) != NOTE]
+    notes = [note for note in read_notes(store, asset) if note.get("kind", NOTE) not in (NOTE, CONFIRMATION)]
     kept_s = config.diagnosis.kept_s
     known = min(MIN_LEARN_S, kept_s), revision.number, revision.parent > 0
     if not notes or notes[-1]["kind"] == BASELINE_NOTE:

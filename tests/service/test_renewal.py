@@ -13,7 +13,7 @@ from axis_logs import REPAIRED, repaired_axis
 from commands import one_line, run
 
 import servoscope as ss
-from servoscope.service import relearning
+from servoscope.service import renewal
 from servoscope.service.assets.status import AssetStatus
 from servoscope.service.build import build_components
 from servoscope.service.config import ServiceFile
@@ -60,7 +60,7 @@ def test_a_repair_is_learned_by_a_running_service_and_one_step_leads_back(hall: 
     store.add_audit("otto", "axis", "note", {"t": t, "text": "motor exchanged", "anew": True, "kind": "repair"})
     now = wait(lambda now: now.position.t > t + 100.0)
     learned = ss.Baseline.load(settings.baseline_file("axis"))
-    progress = relearning.learning_progress(settings, store, "axis", now, learned)
+    progress = renewal.learning_progress(settings, store, "axis", now, learned)
     assert (progress.after, progress.since, progress.revision) == ("repair", t, 1)
     assert 100.0 < progress.learned_s <= progress.needed_s == 200.0
     preview = json.loads(run("relearn", hall, "axis", "--json").out)
@@ -75,7 +75,7 @@ def test_a_repair_is_learned_by_a_running_service_and_one_step_leads_back(hall: 
     renewed = ss.Baseline.load(settings.baseline_file("axis"))
     now = wait(lambda now: now.metadata.baseline == renewed.hash and now.verdict == "healthy")
     assert not now.alarms and not store.pending_commands()
-    assert relearning.learning_progress(settings, store, "axis", now, renewed).can_go_back
+    assert renewal.learning_progress(settings, store, "axis", now, renewed).can_go_back
     # a further healthy stretch joins the one that was kept with the history
     added = json.loads(run("relearn", hall, "axis", "--why", "run in", "--json").out)
     assert added["revision"]["kind"] == "healthy" and added["revision"]["reference"] == 2
