@@ -75,8 +75,8 @@ class Machine:
     worn: bool = False  # whether the wear was found
     planted: int = 0
 
-    def at(self, week: int) -> dict[str, float]:
-        """Let a week pass, and return the parameters then."""
+    def advance(self, week: int) -> None:
+        """Let a week pass."""
         if ANNOUNCED.get(week) == "tool":
             self.ratios["inertia"] = 1.3
         if week >= WEAR_FROM and not self.worn:
@@ -85,6 +85,9 @@ class Machine:
             self.ratios["coulomb_friction"] *= DRY
             self.dry = True
         self.planted += week in (WEAR_FROM, DRY_FROM)
+
+    def at(self, week: int) -> dict[str, float]:
+        """Return the parameters in a week."""
         season = 1.0 + SEASON * np.sin(2.0 * np.pi * week / 52.0)
         return {**self.ratios, "viscous_friction": self.ratios["viscous_friction"] * season * (1.0 + self.wear)}
 
@@ -157,6 +160,7 @@ def follow_year(detector: Servoscope | Simple, folder: Path, seed: int, weeks: i
     """Follow a machine with repairs, another tool and seasons."""
     machine, year = Machine(), Year()
     for week in range(1, weeks + 1):
+        machine.advance(week)
         now, occasion = machine.at(week), ANNOUNCED.get(week)
         file = record(folder, f"week-{week}.csv", seed + 100 + week, now)
         reported = detector.finds(file)

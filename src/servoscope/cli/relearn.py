@@ -73,6 +73,6 @@ def relearn(
         results.print_facts(
             out, [("past values beyond the limit", f"{judged.before} before, {judged.after} after, of {judged.values}")]
         )
-        results.print_notes(out, learned.notes)
+        results.print_notes(out, [*learned.notes, *renewal.offers(learned, status, settings.diagnosis.kept_s)])
     if yes:
         results.print_written_path(out, renewal.put_in_force(settings, store, asset, learned, stretch, t))

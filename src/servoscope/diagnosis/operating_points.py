@@ -15,7 +15,7 @@ from servoscope.diagnosis.learn_faults import LabelledRecordings
 from servoscope.learning import learn as learning
 from servoscope.learning.learn import Progress
 from servoscope.learning.plausibility import check_plausibility, check_wraps
-from servoscope.learning.population import Population
+from servoscope.learning.population import MIN_MACHINES, Population
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 from servoscope.signals.readers import as_recording
@@ -65,11 +65,12 @@ def learn(
         Learn although the coefficients are none that a machine has, or explain less than half of u; the notes then
         say so.
     population
-        Baselines of at least five like machines, or their paths, by name or in a list: how they differ is a prior, so
-        that a new machine needs less healthy data of its own. A machine that is none of them is learned without; the
-        notes say which it was.
+        Baselines of like machines, or their paths, by name or in a list. How five or more differ is a prior, so that a
+        new machine needs less healthy data of its own; a machine that is none of them is learned without, and the notes
+        say which it was. Of fewer, the one of most recordings is the `earlier` one.
     earlier
-        What a baseline of more recordings, from before a repair, knows of how recordings of this machine scatter.
+        A baseline of more recordings, from before a repair or of a copy of the machine: what it knows of how healthy
+        recordings scatter counts until this one has as many.
 
     Returns
     -------
@@ -113,6 +114,9 @@ def learn(
     notes = {name: compare_with_earlier(compare, name, some, progress, accept_change) for name, some in named.items()}
     learned: list[Baseline] = []
     alikes = _named_machines(population)
+    if len(alikes) < MIN_MACHINES:
+        earlier = max([*alikes.values(), *filter(None, [earlier])], key=lambda each: each.scatter_from, default=None)
+        alikes = {}
     for name, some in named.items():
         check_wraps(some)
         like = Population.from_baselines(_machines_at(alikes, name)) if alikes else None

@@ -15,7 +15,7 @@ from servoscope.baseline.records import BaselineSource, ExactPredictorFit, Healt
 from servoscope.baseline.sensors import learn_sensors
 from servoscope.core.arrays import to_tuples
 from servoscope.core.blas import with_one_blas_thread
-from servoscope.core.errors import LoopError, NotEnoughError
+from servoscope.core.errors import BaselineError, LoopError, NotEnoughError
 from servoscope.core.messages import Message, message
 from servoscope.detection.signal_defects import find_switched_off
 from servoscope.estimation import estimators
@@ -23,7 +23,7 @@ from servoscope.isolation.ml.validity import fit_exact_predictor
 from servoscope.learning.axis_fit import fit_axis
 from servoscope.learning.delay import check_delay
 from servoscope.learning.detectability import learn_detectability
-from servoscope.learning.features import learn_features
+from servoscope.learning.features import MIN_RECORDINGS, learn_features
 from servoscope.learning.healthy_plant import PlantKnowledge, learn_plant, learn_sequential_test
 from servoscope.learning.population import Population
 from servoscope.learning.recursion import (
@@ -132,6 +132,9 @@ def _assemble_baseline(
 ) -> Baseline:
     loop, recordings, pipeline = healthy.loop, healthy.recordings, healthy.pipeline
     progress("rehearsal")
+    if earlier is not None and earlier.names != pipeline.bank.names:
+        names = ", ".join(earlier.names), ", ".join(pipeline.bank.names)
+        raise BaselineError(f"the earlier or like baseline has coefficients {names[0]}, this loop {names[1]}")
     before = earlier if earlier is not None and len(recordings) < earlier.scatter_from else None
     scatters = before is not None and not before.thresholds.hypotheses
     calibration, hypotheses, test_notes = learn_sequential_test(healthy, plant, scatters)
@@ -148,6 +151,12 @@ def _assemble_baseline(
     covariance, left_out, transient = widen_scatter(healthy, plant, scatter, paths, thresholds.statistic)
     transient = transient if earlier is not None else 0.0 * transient
     detectability, limits = learn_detectability(healthy, plant, paths, scatter, covariance, transient, thresholds)
+    if before is not None:
+        lacks = (
+            message("learning.carried_features", needed=MIN_RECORDINGS) if before.features and not features else None
+        )
+        known = {"known": before.scatter_from, "own": len(recordings)}
+        limits.append(message("learning.carried", **known, lacks=lacks))
     notes = [*healthy.notes, *plant.notes, *test_notes, *axis_notes, *scatter.notes, *feature_notes, *limits]
     between = to_tuples(scatter.own) if len(recordings) > 1 else ()
     baseline = Baseline(

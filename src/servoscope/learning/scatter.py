@@ -20,6 +20,7 @@ from servoscope.learning.healthy_plant import PlantKnowledge
 from servoscope.learning.recursion import HealthyRecordings
 
 MIN_CERTAIN_STDS = 3.0  # standard deviations from zero from which the scatter of a coefficient is relative
+MIN_NOISE_SHARE = 1e-3  # of a variance, that is not scatter
 MIN_EIGENVALUE = 1e-9  # of a covariance in units of its diagonal
 
 
@@ -88,7 +89,26 @@ def carry_scatter(earlier: Baseline, theta: FloatArray) -> FloatArray:
     before = np.array(earlier.theta)
     certain = before**2 > MIN_CERTAIN_STDS**2 * np.diag(earlier.covariance_array())
     ratios = np.divide(theta, before, out=np.ones_like(theta), where=certain)
-    return variances * ratios**2
+    return np.asarray(variances * ratios**2)
+
+
+def forecast_covariance(baseline: Baseline, more: int) -> FloatArray:
+    """Return the covariance (n, n) to expect of a baseline that learns `more` recordings like those before.
+
+    What is not scatter is noise of the mean, which falls with their number; the scatter is predicted the better, the
+    more recordings show it.
+    """
+    known, m, C = baseline.scatter, len(baseline.sources), baseline.covariance_after(np.array(np.inf))
+    own = np.maximum(np.diag(np.array(known.between)), 0.0) if known.between else np.zeros(len(C))
+    carried = 2.0 * np.array(known.carried or np.zeros(len(C)))
+
+    def ahead(count: int) -> FloatArray:
+        counts = count >= homogeneity.MIN_RECORDINGS or not baseline.thresholds.hypotheses
+        scatter = counts * own * homogeneity.prediction_factor(count)
+        return np.maximum(scatter, carried) if count < known.carried_from else scatter
+
+    noise = np.maximum(np.diag(C) - ahead(m), MIN_NOISE_SHARE * np.diag(C))
+    return C + np.diag(noise * m / (m + more) + ahead(m + more) - np.diag(C))
 
 
 def learn_thresholds(

@@ -127,7 +127,7 @@ class Housekeeping:
                 self._announced[name] = None if kind == BASELINE_NOTE else Announcement(kind, note["t"])
         for name, announced in self._announced.items():
             if name in self._service.assets:  # a file that was read again has made some anew
-                self._service.assets[name].announced = announced
+                self._service.assets[name].announce(announced)
 
     def _execute_commands(self) -> None:
         pending = self._service.store.pending_commands()

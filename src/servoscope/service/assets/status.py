@@ -215,9 +215,9 @@ def asset_status(
     metadata: AssetMetadata,
     reception: Reception = RECEPTION_OK,
     announced: Announcement | None = None,
-    needed_s: float = 0.0,
+    kept_s: float = 0.0,
 ) -> AssetStatus:
-    """Return the status of an asset; `announced`: after which it learns again, from `needed_s` of samples."""
+    """Return the status of an asset; `announced`: after which it learns again; `kept_s`: how long samples are kept."""
     examination, findings = state.examination, quality.active_findings(state.quality)
     now = quality.limit_verdict(examination.verdict, findings)
     ne107 = evaluate_ne107(now, findings, [(definitions[name], alarm) for name, alarm in state.alarms.items()])
@@ -229,6 +229,7 @@ def asset_status(
         summary = render(message("service.examination.stands", fault=fault, t=examination.fault_at, since=summary))
     learning = None
     if announced is not None:
+        needed_s = min(MIN_LEARN_S, kept_s)
         learned_s = min(max(state.position.t - announced.since, 0.0), needed_s)
         learning = LearningStatus(**announced._asdict(), learned_s=learned_s, needed_s=needed_s)
         summary = learning.sentence(summary)

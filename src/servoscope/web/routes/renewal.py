@@ -34,7 +34,9 @@ def _find_config(context: Context, asset: str) -> tuple[ServiceFile, AssetStatus
 def _progress(context: Context, config: ServiceFile, asset: str, status: AssetStatus) -> responses.RelearningState:
     baseline = load_cached(config.baseline_file(asset))
     progress = renewal.learning_progress(config, context.store, asset, status, baseline)
-    return responses.RelearningState(**progress._asdict())
+    point = config.assets[asset].point
+    offers = renewal.offers(baseline.at(point) if point else baseline, status, config.diagnosis.kept_s)
+    return responses.RelearningState(**progress._asdict(), offers=offers)
 
 
 @router.get("/assets/{asset}/relearning")
