@@ -76,8 +76,8 @@ def test_what_more_days_bring_is_foretold(days: ss.Baseline, repaired: ss.Baseli
     foretold = forecast_changes(days, len(DAYS))
     learned = ss.learn(LOOP, [recorded(i, viscous) for i, viscous in enumerate(2 * DAYS)], earlier=days)
     reached = {each.name: each.change for each in learned.detectability.changes}
-    before, after = foretold["viscous friction"]
-    assert after < before and reached["viscous friction"] == pytest.approx(after, rel=0.3)
+    before, after = foretold["viscous_friction"]
+    assert after < before and reached["viscous_friction"] == pytest.approx(after, rel=0.3)
     gained = forecast_changes(repaired, 10)
     assert all(after <= before for before, after in gained.values())
 
