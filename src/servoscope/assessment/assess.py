@@ -189,7 +189,8 @@ def equidistant(log: Samples, name: str) -> tuple[FloatArray, FloatArray | None,
     if not forward.size:
         raise RecordingError(f"{name}: the time does not advance, choose another time column")
     period = float(np.median(forward))
-    breaks = np.flatnonzero((steps > (MAX_FILLED_GAP + 1.5) * period) | (steps <= 0.0)) + 1
+    runs = np.cumsum(log.restart)[valid]  # another mode, for example
+    breaks = np.flatnonzero((steps > (MAX_FILLED_GAP + 1.5) * period) | (steps <= 0.0) | (np.diff(runs) > 0)) + 1
     edges = np.r_[0, breaks, t.size]
     longest = int(np.argmax(np.diff(edges)))
     rows = slice(edges[longest], edges[longest + 1])

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,11 +17,15 @@ from servoscope.cli.app import app
 from servoscope.cli.exit import FailureCounter, print_json
 from servoscope.cli.options import JsonOption, ReadingOptions, ReportOption, with_reading_options
 from servoscope.cli.output_paths import REPORTS, OutputPaths, check_output
-from servoscope.cli.progress import show_steps
+from servoscope.cli.progress import StepProgress, show_steps
 
 if TYPE_CHECKING:
     from servoscope.assessment.assess import Assessment
+    from servoscope.core.workers import Progress
+    from servoscope.models.loop import Columns
     from servoscope.signals.samples import Samples
+
+MIN_FILES_PER_START = 16  # for which it pays to start processes
 
 
 @app.command()
@@ -55,6 +61,10 @@ def assess(
     out, failures = results.create_console(), FailureCounter()
     judged: list[Assessment] = []
     with show_steps(len(logs), 2) as steps:
+        if pages is None and len(logs) >= MIN_FILES_PER_START:
+            for result in assess_files(logs, reader, limits, steps, failures):
+                judged.append(result)
+            logs = []
         for path in logs:
             steps.begin(path.name)
             with failures.catch():
@@ -81,17 +91,73 @@ def assess(
     failures.exit_if_any()
 
 
+def assess_files(
+    logs: Sequence[Path],
+    reader: arguments.RecordingReader,
+    travel: tuple[float, float] | None,
+    steps: StepProgress,
+    failures: FailureCounter,
+) -> Iterator[Assessment]:
+    """Yield the assessments of many files as they end, on all cores."""
+    from servoscope.assessment.assess import Assessment
+    from servoscope.core.workers import WorkerError, Workers
+
+    tasks = ((path, reader, travel) for path in logs)
+    for (path, *_), results in Workers().map(f"{__name__}:assess_file", tasks, os.cpu_count() or 1):
+        steps.begin(path.name)
+        with failures.catch():
+            if isinstance(results, WorkerError):
+                raise results
+            yield from map(Assessment.model_validate, results)
+
+
+def assess_file(
+    _: Progress, task: tuple[Path, arguments.RecordingReader, tuple[float, float] | None]
+) -> list[dict[str, Any]]:
+    """Assess the loops of one file, in a process of its own."""
+    from servoscope.assessment.assess import assess as assess_log
+
+    path, reader, travel = task
+    return [
+        assess_log(samples, name=name, travel=travel).model_dump(mode="json")
+        for name, samples in read_loops(path, reader)
+    ]
+
+
 def read_loops(path: Path, reader: arguments.RecordingReader) -> Iterator[tuple[str, Samples]]:
     """Yield the loops in a file with their names: by the mapping, or by the names of its columns."""
     from servoscope.assessment.tags import find_loops
     from servoscope.signals.readers.frames import open_source
-    from servoscope.signals.readers.recording_file import read_rows
 
     given = reader.columns
     loops = {"": given} if given is not None else find_loops(open_source(path, reader.text).columns)
     first, last = reader.span
+    for name, tag, samples in read_tags(path, loops, reader):
+        rows = samples if reader.span == arguments.UNBOUNDED else samples[(samples.t >= first) & (samples.t < last)]
+        yield f"{name}[{tag}]" if len(loops) > 1 else name, rows
+
+
+def read_tags(
+    path: Path, loops: Mapping[str, Columns], reader: arguments.RecordingReader
+) -> Iterator[tuple[str, str, Samples]]:
+    """Yield name, tag and samples of loops that share a file; it is read once for all that have no modes."""
+    from servoscope.signals.readers.recording_file import read_rows
+
+    plain = {tag: columns for tag, columns in loops.items() if not columns.segment}
     for tag, columns in loops.items():
-        columns = columns.model_copy(update={"text": reader.text or columns.text})
-        for name, samples in read_rows(path, columns, reader.where, reader.by).items():
-            rows = samples if reader.span == arguments.UNBOUNDED else samples[(samples.t >= first) & (samples.t < last)]
-            yield f"{name}[{tag}]" if len(loops) > 1 else name, rows
+        if columns.segment or len(plain) == 1:
+            columns = columns.model_copy(update={"text": reader.text or columns.text})
+            for name, samples in read_rows(path, columns, reader.where, reader.by).items():
+                yield name, tag, samples
+    if len(plain) > 1:
+        signals = {
+            x for columns in plain.values() for x in (columns.reference, columns.input, str(columns.output)) if x
+        }
+        some = next(iter(plain.values()))
+        whole = some.model_copy(update={"text": reader.text or some.text, "covariates": {x: x for x in signals}})
+        for name, samples in read_rows(path, whole, reader.where, reader.by).items():
+            channels = samples.channels
+            for tag, columns in plain.items():
+                u, y = channels[columns.input], channels[str(columns.output)]
+                r = channels[columns.reference] if columns.reference else u
+                yield name, tag, replace(samples, r=r, u=u, y=y, channels={})

@@ -34,14 +34,14 @@ from servoscope.web.routes import (
     diagnoses,
     events,
     notifications,
-    relearning,
+    renewal,
     session,
     uploads,
 )
 
 HELP = "/help"  # where the documentation is
 CLEANUP_S = 3600.0  # between two removals of expired uploads
-ROUTE_MODULES = (session, assets, alarms, events, diagnoses, uploads, baselines, designs, relearning, notifications)
+ROUTE_MODULES = (session, assets, alarms, events, diagnoses, uploads, baselines, designs, renewal, notifications)
 
 
 def create_app(context: Context) -> ASGIApp:
