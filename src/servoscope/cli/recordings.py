@@ -141,9 +141,9 @@ def learn(
     if add:
         others = output is not None or nominal or compare is not None or fault or population
         more = [*add, *([str(loop)] if loop is not None else []), *(healthy or ())]
-        known = None if others else baseline
+        path = None if others else baseline
         add_recordings(
-            known, more, reading, as_json, after, why, who, accept_change, accept_delay=accept_delay, force=force
+            path, more, reading, as_json, after, why, who, accept_change, accept_delay=accept_delay, force=force
         )
         return
     if loop is None or output is None:
