@@ -44,6 +44,9 @@ def _listen(broker: str, topic: str, seconds: float, name: str) -> list[dict[str
     host, _, port = place.partition(":")
     records: list[dict[str, Any]] = []
 
+    def subscribe(*_: object) -> None:
+        client.subscribe(topic)
+
     def receive(client: Client, data: object, message: Any) -> None:
         try:
             record = json.loads(message.payload)
@@ -55,7 +58,7 @@ def _listen(broker: str, topic: str, seconds: float, name: str) -> list[dict[str
 
     client = Client(CallbackAPIVersion.VERSION2)
     client.connect_timeout = TIMEOUT_S
-    client.on_connect = lambda *_: client.subscribe(topic)
+    client.on_connect = subscribe
     client.on_message = receive
     if account:
         client.username_pw_set(*account.split(":", 1))
