@@ -31,16 +31,16 @@ test test-all:
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(SELECTION); tests=$$?; \
 	wait $$types; types=$$?; echo '$(TYPES)'; cat .cache/types.log; exit $$((tests || types))
 
-lint: style     ## format, lint and types, without changing a file
+lint: style     ## format and lint of the whole tree, and types, without changing a file
 	$(TYPES)
 
 style: $(STAMP)
-	$(BIN)/python -m ruff format --check $(CODE)
-	$(BIN)/python -m ruff check $(CODE)
+	$(BIN)/python -m ruff format --check .
+	$(BIN)/python -m ruff check .
 
 format: $(STAMP)  ## put the code into shape
-	$(BIN)/python -m ruff check --fix $(CODE)
-	$(BIN)/python -m ruff format $(CODE)
+	$(BIN)/python -m ruff check --fix .
+	$(BIN)/python -m ruff format .
 
 figures: $(STAMP)  ## run the programs behind the figures of the documents, and print what differs (half an hour)
 	$(BIN)/python scripts/figures.py --run

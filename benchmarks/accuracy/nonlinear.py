@@ -1,16 +1,17 @@
 """The nonlinear rig: where the linear inverse ends, and what the square-root valve law is worth; prints Markdown.
 
-    python benchmarks/accuracy/nonlinear.py [--json] [--figure FILE.png]
+    python benchmarks/accuracy/nonlinear.py [--quick] [--json] [--figure FILE.png]
 
-Every simulation has its own seed. The loop file knows the rig's delay of 12.8 ms (one sample and the valve) unless a
-row says otherwise. About eight minutes on one core.
+With --share, the least squares of the first table and one diagnosis: some seconds. Every simulation has its own seed.
+The loop file knows the rig's delay of 12.8 ms (one sample and the valve) unless a row says otherwise. About eight
+minutes on one core.
 """
 
 from __future__ import annotations
 
 import functools
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
@@ -153,6 +154,8 @@ METHODS = (
     Method("square root on a rig without friction", SQUARE_ROOT, rig=Rig(coulomb=0.0, static=0.0)),
 )
 SHOWN = (2, 6, 9)  # methods whose explanations are told
+SHARE = 9  # the method whose diagnosis of a leak --share repeats
+IN_SHORT = (0, 2, 6, 8, 9)  # of the page for users
 CONDITIONS = (
     ("as learned", tuple({"seed": seed} for seed in range(50, 54))),
     ("amplitude 0.5, 0.8", tuple({"seed": 60 + i, "amplitude": (0.5, 0.8)[i % 2]} for i in range(4))),
@@ -201,6 +204,14 @@ def methods() -> Iterator[Table]:
         rows.append(
             (how.words, *alarms, f"{len(seen)} of 12", f"{len(right)}, {wrong}", size, f"{np.median(late):.1f} s")
         )
+    columns = ("method", *(words for words, _ in CONDITIONS), "found", "named right, wrong", "error of size")
+    columns = (*columns, "median delay")
+    yield Table(
+        "Methods",
+        "Alarms on healthy recordings, and faults p_s x 0.8, C_ie x 1.2, b_p x 20, beta x 0.1, over three references.",
+        columns,
+        tuple(rows[i] for i in IN_SHORT),
+    )
     yield Table(
         "False alarms and faults",
         "Alarms on healthy recordings (four for each of three references), and the four faults p_s x 0.8, C_ie x 1.2, "
@@ -209,7 +220,7 @@ def methods() -> Iterator[Table]:
         "scale, the median of those named rightly. Warmer oil is a leak of 1.22 and colder oil one of 0.82: alarms in "
         "that column are right about the actuator and wrong about its health. A polynomial plant has no physical "
         "names.",
-        ("method", *(words for words, _ in CONDITIONS), "found", "named right, wrong", "error of size", "median delay"),
+        columns,
         tuple(rows),
     )
 
@@ -356,18 +367,37 @@ def draw(path: Path) -> None:
     plt.close(figure)
 
 
-def tables() -> Iterator[Table]:
-    """Measure everything."""
-    for part in (effects, methods, names, pressure, over_amplitude):
-        yield from part()
+def values(made: Sequence[Table]) -> dict[str, str]:
+    """Return the figures that stand in sentences of the page, of the tables that were made."""
+    rows = {table.title: {row[0]: row[1:] for row in table.rows} for table in made}
+    alone = rows["What each effect does to the inverse"]
+    whole, how = alone["all of them at 40 degC"], METHODS[SHARE]
+    leak = ss.diagnose(how.baseline("multisine"), how.recording("multisine", 21, fault=f"C_ie=1.2@{FAULT_AT:g}"))
+    found = {
+        "residual.linear-rig": alone["none: the linear rig"][0],
+        "residual.linear": whole[0],
+        "residual.root": whole[1],
+        "multisine.linear": whole[2].split(", ")[1],
+        "multisine.root": whole[3].split(", ")[1],
+        "warmer": alone["oil 5 K warmer"][2].split(", ")[1],
+        "leak": _best(leak),
+    }
+    if sines := rows.get("Describing function"):
+        found |= {f"sine.{mm}": sines[f"{mm} mm"][4].split(", ")[0] for mm in (5, 60)}
+        roots = [abs(float(row[column].split(", ")[0]) - 1.0) for row in sines.values() for column in (1, 3, 5)]
+        found["sine.root"] = f"{100.0 * max(roots):.0f} %"
+    return found
 
 
 def main() -> None:
     """Print the tables, and draw if wanted."""
     options = parser(__doc__)
+    options.add_argument("--share", action="store_true", help="only what takes some seconds")
     options.add_argument("--figure", type=Path, help="where to draw the describing function over amplitude")
     given = options.parse_args()
-    show(tables(), given.json)
+    parts = (effects,) if given.share else (effects, over_amplitude, methods, names, pressure)
+    made = [table for part in parts for table in part()]
+    show(made, given.json, values(made))
     if given.figure:
         draw(given.figure)
 
