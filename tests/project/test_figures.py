@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -155,3 +156,23 @@ def test_the_same_page_has_the_same_hash_at_another_time() -> None:
     report = "<head><title>x</title></head><h1>Fault: <b>leakage</b></h1><svg>{}</svg>"
     assert pictures.shown_by_report(report.format(1)) == pictures.shown_by_report(report.format(2))
     assert pictures.shown_by_report(report) != pictures.shown_by_report(report.replace("leakage", "pump"))
+
+
+MEASURED = ("README", "accuracy", "benchmarks", "fleet", "how-it-works", "nonlinear-rig", "paper", "reliability")
+MEASURED = (*MEASURED, "before-deployment", "results", "speed")
+DATE = re.compile(r"[Mm]easured\W+(?:on )?20\d\d-\d\d-\d\d, commit `[0-9a-f]{7}`|Estimate|one run of \w+ 20\d\d")
+NO_MEASUREMENTS = ("paper.md: ## Where each equation is", "nonlinear-rig.md: ## Simulation")
+FIGURE = re.compile(r"(?<![\w`])\d+(?:\.\d+)?")
+
+
+def test_a_table_of_measured_figures_has_a_program_or_a_date() -> None:
+    """Between markers, or in a section that says when it was measured: not everything can be measured again in CI."""
+    undated = []
+    for page in [PROJECT / "README.md", *(PROJECT / "docs").rglob("*.md")]:
+        text = page.read_text(encoding="utf-8")
+        for section in re.split(r"^(?=#+ )", text, flags=re.M) if page.stem in MEASURED else ():
+            own = re.sub(r"<!-- table .*?<!-- end -->|`[^`]*`|\]\([^)]*\)", "", section, flags=re.S)
+            rows = [line for line in own.splitlines() if line.startswith("|") and "<!-- value" not in line]
+            if sum(bool(FIGURE.search(row)) for row in rows) > 2 and not DATE.search(section):
+                undated.append(f"{page.name}: {section.splitlines()[0]}")
+    assert set(undated) == set(NO_MEASUREMENTS)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from accuracy import nonlinear, run
-from recordings import RIG, Judged
+from recordings import RIG
 
 import servoscope as ss
 from design import size
@@ -26,13 +26,12 @@ from servoscope.simulation import reference, simulate
 PROJECT = Path(__file__).resolve().parents[2]
 # scenarios of docs/accuracy.md of which the first unit of work takes about a second
 SCENARIOS = (
-    "alarms/leakage-profile-60s",
     "bias/healthy",
     "motion/valve-trapezoid",
     "signals/axis-2-friction",
     "smooth/axis-2-friction",
 )
-MAX_RELATIVE_DIFFERENCE = 1e-3  # a time of an alarm is one of 10 a second
+TOLERANCES = {"rel": 1e-3, "abs": 1e-4}  # pages show two digits, shares of a bias to 0.01 %
 
 
 def stored(program: str) -> dict[str, Any]:
@@ -61,7 +60,7 @@ def test_a_scenario_finds_what_is_stored(scenario: str) -> None:
     before = list(numbers(run.stored_results()[scenario]["numbers"][0]))
     after = list(numbers(json.loads(json.dumps(run.SCENARIOS[scenario].run(0)))))
     assert after == [
-        pytest.approx(value, rel=MAX_RELATIVE_DIFFERENCE) if isinstance(value, float) else value for value in before
+        pytest.approx(value, **TOLERANCES) if isinstance(value, float) else value for value in before
     ]
 
 
@@ -85,11 +84,3 @@ def test_the_design_study_is_as_its_page_says() -> None:
     match = match_mimic(scene, mimic_causes(scene)[0])
     fault = loop.plant.faults[match.fault].name
     assert rows("mimics", "Mimics")["another mass"][2].startswith(f"{fault}, {match.cosine[match.fault]:.3f}, ")
-
-
-def test_a_fault_of_the_independent_rig_is_named_as_the_page_says(shared_data: Path) -> None:
-    loop, folder = ss.Loop.load(RIG), shared_data / "eha_cases"
-    learned = ss.learn(loop, [ss.read(folder / "multisine_healthy_2.csv", loop)])
-    case = "multisine_C_iex1.2_11"
-    judged = Judged.of(learned, ss.read(folder / f"{case}.csv", loop))
-    assert judged.candidate == rows("recordings", "Reference rig")[case][2]
