@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from servoscope.assessment.posterior import CAUSES
+from servoscope.assessment.causes import CAUSES
 
 Floats = npt.NDArray[np.float64]
 
@@ -78,7 +78,7 @@ class _Lanes:
         rng, n = self.rng, self.n
         self.tau = self.draw("time constant")
         if not self.test:  # plants are sampled more slowly than the test family is
-            self.tau *= np.where(rng.random(n) < 0.3, 0.25, 1.0)
+            self.tau *= rng.choice([1.0, 0.25, 0.05], n, p=[0.4, 0.3, 0.3])
         self.dead = np.maximum(self.tau * self.draw("dead time"), 1.0 if self.test else 0.25)
         small = 0.02 if not self.test else 0.5
         self.lag2 = np.maximum(self.tau * small * rng.random(n), 0.25)
@@ -109,6 +109,9 @@ class _Lanes:
         margin = self.draw("good margin")
         for cause, name in (("too tight", "tight margin"), ("too sluggish", "sluggish margin")):
             margin = np.where(self.cause == cause, self.draw(name), margin)
+        if not self.test:  # valves stick behind cautious controllers too: then the log holds few slips
+            worn = np.isin(self.cause, ["stiction", "backlash"])
+            margin = np.where(worn, margin * np.exp(rng.uniform(0.0, 1.8, n)), margin)
         self.margin = margin
         w = np.geomspace(0.01, np.pi, 600)[None, :] / np.minimum(self.dead, 20.0)[:, None]
         s = 1j * w

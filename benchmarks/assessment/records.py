@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.assessment.assess import MIN_ROWS, equidistant
+from servoscope.assessment.causes import CAUSES
 from servoscope.assessment.features import analyse
-from servoscope.assessment.posterior import CAUSES
 from servoscope.models.loop import Columns
 from servoscope.signals.readers.recording_file import read_rows
 from servoscope.signals.samples import Samples
@@ -59,7 +59,7 @@ def measured(folder: Path) -> Records:
 
 
 def servos(folder: Path) -> Records:
-    """Return healthy servo recordings, of two large folders every twelfth: any cause but stiction and backlash."""
+    """Return healthy servo recordings, of two large folders every twelfth: nothing is wrong but perhaps the grid."""
     rows, names = [], []
     for i, (of, name, log) in enumerate(servo_logs(folder)):
         if of in ("sts3215", "ur10e") and i % EVERY:
@@ -68,7 +68,7 @@ def servos(folder: Path) -> Records:
         if y.size >= MIN_ROWS:
             rows.append(analyse(r, u, y).features)
             names.append(of)
-    possible = np.array([[cause not in ("stiction", "backlash") for cause in CAUSES]] * len(rows))
+    possible = np.array([[cause in ("good", "quantisation") for cause in CAUSES]] * len(rows))
     return _records(rows, possible, names, [np.nan] * len(rows))
 
 

@@ -25,7 +25,7 @@ SIMULATED, SEED = 1200, 2
 LOOP_WEIGHT = 8.0  # what one measured loop counts, in simulated ones; its logs share it
 BACKLASH_WEIGHT = 0.5  # valves stick more often than they have play
 SERVO_WEIGHT = 20.0  # the same of all servo recordings in a folder
-PENALTY = 1.5e-3  # on squared weights, per record
+PENALTY = 5e-4  # on squared weights, per record
 
 Floats = npt.NDArray[np.float64]
 

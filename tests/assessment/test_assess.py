@@ -15,7 +15,10 @@ from servoscope.assessment.assess import VERDICTS, Assessment
 from servoscope.assessment.plant_loops import group_by_period, rank
 from servoscope.assessment.tags import find_loops
 from servoscope.cli import app
+from servoscope.cli.assess import MIN_FILES_PER_START
 from servoscope.core.messages import speak
+from servoscope.learning.learn import doubt_healthy
+from servoscope.signals import clean
 
 N = 1200
 T = np.arange(N) * 10.0
@@ -77,6 +80,18 @@ def test_a_missing_reference_and_gaps_do_not_stop_it() -> None:
     assert result.signals.t.size == 900  # the gap of two rows is filled, the one of a hundred cuts
 
 
+def test_rows_in_manual_mode_are_cut_out() -> None:
+    log = loop(5)
+    mode = np.where((np.arange(N) > 700) & (np.arange(N) < 900), 0.0, 1.0)
+    u = np.where(mode > 0.0, log["u"], 40.0)
+    result = ss.assess({**log, "u": u, "MODE": mode})
+    assert result.signals is not None
+    assert result.signals.t.size == 701
+    assert "mode" in find_loops(["Date", "FIC101.PV", "FIC101.OP", "FIC101.mode"])["FIC101"].segment[0]
+    words = {**log, "mode": np.where(mode > 0.0, "AUTO", "MAN")}
+    assert ss.assess(words).signals is not None
+
+
 def test_a_million_rows_are_thinned() -> None:
     rng = np.random.default_rng(6)
     u = np.cumsum(rng.standard_normal(1_000_000)) * 0.01
@@ -123,7 +138,7 @@ def test_loops_with_one_period_are_grouped_with_the_likeliest_source_first() -> 
 
 
 def test_the_command_ranks_an_export_and_writes_pages_and_a_work_list(tmp_path: Path) -> None:
-    sticks, good = loop(7, stick=4.0), loop(8)
+    sticks, good = loop(13, stick=4.0), loop(5)
     names = {"r": "SP", "u": "OP", "y": "PV"}
     columns = {"t": T}
     for tag, log in (("FIC1", sticks), ("FIC2", good)):
@@ -163,3 +178,33 @@ def test_process_loops_are_judged(shared_data: Path) -> None:
     for name in files[:2]:
         result = ss.assess(folder / name)
         assert result.probabilities["stiction"] + result.probabilities["backlash"] > 0.3, name
+
+
+def test_a_sticking_valve_is_no_healthy_recording_to_learn_from() -> None:
+    log, good = loop(13, stick=2.0), loop(3)
+    doubt = doubt_healthy(recorded(log, "monday.csv"))
+    assert doubt is not None
+    assert "monday.csv" in str(doubt)
+    with speak("de"):
+        assert "Haftreibung" in str(doubt)
+    assert doubt_healthy(recorded(good, "friday.csv")) is None
+
+
+def recorded(log: dict[str, np.ndarray], name: str) -> ss.Recording:
+    t, r, u, y = (log[key] for key in ("t", "r", "u", "y"))
+    return clean(t, r, u, y, name=name, sample_rate=0.1)
+
+
+def test_many_files_are_assessed_in_processes_and_one_that_is_broken_costs_itself_only(tmp_path: Path) -> None:
+    log = {name: x[:150] for name, x in loop(13, stick=4.0).items()}
+    lines = [",".join(log), *(",".join(f"{x:.6g}" for x in row) for row in zip(*log.values(), strict=True))]
+    for k in range(MIN_FILES_PER_START - 1):
+        (tmp_path / f"FIC{k}.csv").write_text("\n".join(lines))
+    (tmp_path / "broken.csv").write_text("t,u\n1,2\n")
+    run = CliRunner().invoke(app, ["assess", str(tmp_path), "--json"])
+    results = [json.loads(line) for line in run.stdout.splitlines()]
+    assert sorted(result["recording"] for result in results) == sorted(p.name for p in tmp_path.glob("FIC*.csv"))
+    alone = ss.assess(tmp_path / "FIC0.csv").model_dump(mode="json")
+    assert all({**result, "recording": "FIC0.csv"} == alone for result in results)
+    assert run.exit_code != 0
+    assert "broken.csv" in run.stderr

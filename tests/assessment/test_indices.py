@@ -63,12 +63,15 @@ def test_stick_slip_is_the_obvious_loop() -> None:
     rng = np.random.default_rng(6)
     u = np.cumsum(rng.standard_normal(300))
     static, kinetic = 1.5, 0.4
-    x, expected = u[0], []
+    first = u[0] + 1.0
+    x, expected = first, []
     for value in u:
         if abs(value - x) > static:
             x = value - np.sign(value - x) * kinetic
         expected.append(x)
-    np.testing.assert_allclose(models.stick_slip(u, np.array([static]), np.array([kinetic]))[0], expected)
+    np.testing.assert_allclose(
+        models.stick_slip(u, np.array([static]), np.array([kinetic]), np.array([first]))[0], expected
+    )
 
 
 @pytest.mark.parametrize(("jump", "kind"), [(1.5, "stick"), (0.0, "dead_band")])
@@ -76,7 +79,7 @@ def test_the_model_that_made_the_record_is_the_likeliest(jump: float, kind: str)
     rng = np.random.default_rng(7)
     u = 5.0 * SINE + 0.3 * rng.standard_normal(N)
     size = 1.5
-    x = models.stick_slip(u, np.array([0.5 * (size + jump)]), np.array([0.5 * (size - jump)]))[0]
+    x = models.stick_slip(u, np.array([0.5 * (size + jump)]), np.array([0.5 * (size - jump)]), u[:1])[0]
     y = np.zeros(N)
     for k in range(2, N):
         y[k] = 0.7 * y[k - 1] + 0.3 * x[k - 2]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -272,6 +273,11 @@ def test_stderr_that_is_no_terminal_says_now_and_then_what_goes_on(
             time.sleep(0.001)
             said = capsys.readouterr()
             out, err = out + said.out, err + said.err
+        steps.begin("day.csv")
+        steps.count_rows("day.csv", 12_000, 0.4)
+        assert steps.describe() == "day.csv: 12 000 rows, 40%"
+        steps.count_rows("day.csv", 12_000, math.nan)
+        assert steps.describe() == "day.csv: 12 000 rows"
     with progress.show_count() as show:
         show("items", 3, 40)
         while "items: 3 of 40, " not in err:

@@ -329,3 +329,8 @@ def test_refuses_a_plant_without_values() -> None:
     loop = Loop.from_dict({"sample_rate": 100.0, "plant": {"kind": "polynomial", "order": 2}})
     with pytest.raises(LoopError, match="nominal values"):
         ss.design_study(loop)
+
+
+def test_a_path_is_a_loop_too(tmp_path: Path) -> None:
+    with pytest.raises(LoopError, match="no such file"):
+        ss.design_study(tmp_path / "loop.toml")

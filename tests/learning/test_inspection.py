@@ -307,6 +307,14 @@ def test_the_current_of_a_stepper_is_hardly_explained(shared_data: Path) -> None
     assert found.residual is not None and found.residual.period_s == pytest.approx(12.96)
 
 
+def test_many_repetitions_of_the_reference_change_no_cutoff(rig: dict[str, Any]) -> None:
+    """In ten minutes the lines of a period of 10 s lie far apart, and the band is that of one minute."""
+    repeated = np.tile(reference("multisine", 60.0, 100.0), 10)
+    found = inspect(simulate(Loop.from_dict(rig), repeated)[0])
+    assert found.suggested_cutoff_hz == 10.0
+    assert found.band is not None and found.band.low_hz < 0.1 and found.band.high_hz > 15.0
+
+
 def test_period_of_the_reference(rig: dict[str, Any]) -> None:
     loop = Loop.from_dict(rig)
     for kind in ("profile", "multisine", "trapezoid", "steps", "chirp"):

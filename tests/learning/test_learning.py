@@ -13,10 +13,12 @@ import pytest
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import BaselineError, NotEnoughError, RecordingError
+from servoscope.diagnosis import operating_points
 from servoscope.diagnosis.diagnose import diagnose
 from servoscope.learning.learn import learn_baseline, nominal_baseline
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
+from servoscope.signals.recording import thin_out
 from servoscope.simulation import FaultEvent, reference, simulate
 
 
@@ -58,6 +60,23 @@ def test_scatter_between_recordings_counts(rig: dict[str, Any], record: Callable
     assert mixed.covariance[0][0] > 10.0 * same.covariance[0][0]
     by_parameter = {p.parameter: p.change for p in mixed.detectability.changes}
     assert by_parameter["C_ie"] is not None and by_parameter["C_ie"] > 0.05
+
+
+def test_of_long_recordings_stretches_are_learned_and_the_whole_is_judged(
+    rig: dict[str, Any], record: Callable[..., Recording], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop = Loop.from_dict(rig)
+    day = record(loop, seconds=600.0)
+    monkeypatch.setattr(operating_points, "MAX_SAMPLES", 20_000)
+    learned = operating_points.learn(loop, day)
+    assert learned.sources[0].samples == 20_000
+    (note,) = [str(note) for note in learned.notes if "evenly spread" in str(note)]
+    assert "learned from 20000 of 60000 rows" in note and "Healthy" in note
+    worn = record(loop, seconds=600.0, faults=[FaultEvent("C_ie", 1.3, 300.0)])
+    assert diagnose(learned, worn).faults[0].ratio == pytest.approx(1.3, rel=0.05)
+    stretches = thin_out(day, 20_000, 5000)
+    assert stretches.restart.sum() == 4 and stretches.t[0] == day.t[0] and stretches.t[-1] == day.t[-1]
+    assert np.array_equal(stretches.y[:5000], day.y[:5000]) and not day.restart[1:].any()
 
 
 def test_more_data_promise_more(rig: dict[str, Any], record: Callable[..., Recording]) -> None:

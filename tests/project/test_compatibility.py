@@ -236,6 +236,7 @@ def test_a_service_goes_on_from_an_old_store_and_ends_as_it_did(tmp_path: Path) 
         ours, theirs = found["states"][asset].pop("numbers"), state.pop("numbers")
         # Sums near zero are among them, of which rounding elsewhere changes any number of digits.
         assert ours == theirs if SAME_MACHINE else len(ours) == len(theirs), asset
+        state["document"]["judged"]["control"] = None  # kept from 1.1 on
     assert differences(found, expected, ITERATED) == []
     verdicts = [row["verdict"] for row in found["diagnoses"] if row["asset"] == "press" and row["grounds"] == "full"]
     assert verdicts == ["fault"]

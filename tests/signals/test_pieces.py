@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import functools
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.csv
 import pytest
 from dirty import RATE, cleaned, signals
 from logs import lines, written
@@ -164,6 +168,40 @@ class TestExamination:
             assert [(fault.name, round(fault.ratio, 2)) for fault in said.faults] == [("leakage", 1.3)]
             assert said.onset_s is not None
             assert said.onset_s[0] - 0.1 <= at <= said.onset_s[2] + 0.1
+
+
+# the memory that a diagnosis takes beyond what it takes of a fifth of the log, in bytes per row
+MEASURE = """
+import resource, sys
+from servoscope.core import outofcore
+outofcore.SPILL_BYTES = 1 << 20
+import servoscope as ss
+for path in sys.argv[2:]:
+    assert ss.diagnose(sys.argv[1], path).verdict == "healthy"
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+MAX_BYTES_PER_ROW = 40  # as columns in memory r, u, y and t alone would take 32
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the largest resident size has another unit")
+def test_the_memory_of_60_mb_does_not_grow_with_the_rows(tmp_path: Path) -> None:
+    learned().save(tmp_path / "baseline.json")
+    r = np.tile(reference("multisine", 60.0, RATE), 50)
+    repeated, paths, counts = simulate(rig(), r, seed=3)[0].rows(slice(6000, None)), [], (1, 5)
+    for times in counts:
+        paths.append(tmp_path / f"{times}.csv")
+        with paths[-1].open("wb") as file:
+            file.write(b"t,r,u,y\n")
+            for begin in range(times):
+                t = (np.arange(repeated.samples) + begin * repeated.samples) / RATE
+                columns = {"t": t.round(4), **{name: getattr(repeated, name).round(7) for name in "ruy"}}
+                pyarrow.csv.write_csv(pa.table(columns), file, pyarrow.csv.WriteOptions(include_header=False))
+    assert paths[-1].stat().st_size > 50e6
+    done = subprocess.run(
+        [sys.executable, "-c", MEASURE, tmp_path / "baseline.json", *paths], capture_output=True, text=True, check=True
+    )
+    small, large = map(int, done.stdout.split())
+    assert (large - small) * 1024 < MAX_BYTES_PER_ROW * (counts[1] - counts[0]) * repeated.samples
 
 
 def told(diagnosis: Diagnosis, trace: Trace) -> list[object]:

@@ -1,5 +1,1 @@
 """One log of a loop without a baseline: what is most likely wrong with it, and how sure that is."""
-
-from servoscope.assessment.assess import Assessment, assess
-
-__all__ = ["Assessment", "assess"]

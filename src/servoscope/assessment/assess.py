@@ -10,8 +10,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, PrivateAttr
 
 from servoscope.assessment import indices
+from servoscope.assessment.causes import CAUSES, MIN_ALARM_PROBABILITY, POOR_CONTROL, Cause
 from servoscope.assessment.features import Analysis, analyse
-from servoscope.assessment.posterior import CAUSES, Cause, load_posterior
+from servoscope.assessment.posterior import load_posterior
 from servoscope.assessment.tags import find_loops
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import RecordingError
@@ -71,7 +72,7 @@ class Assessment(ShortRepr, BaseModel):
     Examples
     --------
     >>> ss.assess("friday.csv").verdict
-    'too tight'
+    'good'
     """
 
     model_config = ConfigDict(frozen=True)
@@ -101,6 +102,11 @@ class Assessment(ShortRepr, BaseModel):
     def signals(self) -> AssessedSignals | None:
         """What figures are drawn from; None when the assessment was read back from JSON."""
         return self._signals
+
+    @property
+    def alarming_cause(self) -> Cause | None:
+        """The cause, where it is one of poor control and nearly certain."""
+        return self.verdict if self.verdict in POOR_CONTROL and self.probability >= MIN_ALARM_PROBABILITY else None
 
     @property
     def oscillates(self) -> bool:
@@ -183,7 +189,8 @@ def equidistant(log: Samples, name: str) -> tuple[FloatArray, FloatArray | None,
     if not forward.size:
         raise RecordingError(f"{name}: the time does not advance, choose another time column")
     period = float(np.median(forward))
-    breaks = np.flatnonzero((steps > (MAX_FILLED_GAP + 1.5) * period) | (steps <= 0.0)) + 1
+    runs = np.cumsum(log.restart)[valid]  # another mode, for example
+    breaks = np.flatnonzero((steps > (MAX_FILLED_GAP + 1.5) * period) | (steps <= 0.0) | (np.diff(runs) > 0)) + 1
     edges = np.r_[0, breaks, t.size]
     longest = int(np.argmax(np.diff(edges)))
     rows = slice(edges[longest], edges[longest + 1])

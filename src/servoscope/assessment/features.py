@@ -16,7 +16,7 @@ MAX_SAMPLES = 1500  # that models are fitted to
 SCALES = (1, 4, 16)  # samples that are averaged before models are fitted: jumps hide in the noise of single samples
 SCALE_NAMES = ("", "4: ", "16: ")
 MIN_SCALED = 50  # samples at a scale
-SAMPLES_PER_PERIOD = 40.0  # that a long record is thinned to
+SAMPLES_PER_PERIOD = 120.0  # that a long record is thinned to
 ROUNDING = 1e-7  # of a signal's range, below which two numbers are the same
 
 
@@ -136,7 +136,7 @@ def _scale_features(
         f[f"{name} gain"] = min(float(np.sqrt(gain / fit.samples)), 1.0)
         f[f"{name} evidence"] = float(np.log1p(gain))
     f["slip"] = _signed_log(fit.between(fit.dead_band, fit.stick))
-    f["size"] = max(fit.stick.size, fit.dead_band.size) / max(float(np.ptp(u)), 1e-300)
+    f["size"] = min(max(fit.stick.size, fit.dead_band.size) / max(float(np.ptp(u)), 1e-300), 1.0)
     f["jump"] = fit.stick.jump / fit.stick.size
     f["response"] = float(np.log1p(max(fit.between(fit.alone, fit.linear), 0.0)))
     f["margin"] = float(np.log10(np.clip(margins.gain, 0.3, 100.0)))

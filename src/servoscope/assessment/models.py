@@ -15,14 +15,15 @@ from numpy.polynomial import polynomial
 
 from servoscope.core.arrays import FloatArray
 
-ORDER = 3  # lags of y
+ORDER = 6  # lags of y: enough for a process with noise of its own
 INPUTS = 2  # lags of x
 MAX_DELAYS = 15  # tried with the linear loop
-SIZES = tuple(np.geomspace(0.06, 0.95, 15).tolist())  # S over the range of u; slips depend on it sharply
-JUMPS = (0.0, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)  # J over S; 0 is a dead band
-FINER_SIZES = (0.88, 0.92, 0.96, 1.0, 1.04, 1.08, 1.12)  # around the best of the grid
-FINER_JUMPS = (0.8, 1.0, 1.25)
-KEPT, REFINED = 8, 3  # points of the grid that are fitted at all scales, and searched around
+SIZES = tuple(np.geomspace(0.06, 0.95, 16).tolist())  # S over the range of u
+JUMPS = (0.2, 0.5, 0.8, 1.0)  # J over S
+PHASES = (-0.8, -0.4, 0.0, 0.4, 0.8)  # first position less u(0), over f_S
+SIZES_OF_BAND = tuple(np.geomspace(0.06, 0.95, 15).tolist())  # of a dead band over the range of u
+KEPT, REFINED = 8, 4  # points that are fitted at all scales, and searched around
+STEPS, SEARCH_STEP = 16, 0.12  # of the search around a point: tries, and their standard deviation in the first round
 CLIPS = (0.7, 0.85, 0.95)  # quantiles of u from which on the actuator would not follow
 
 
@@ -56,13 +57,13 @@ class ModelComparison(NamedTuple):
         return float(0.5 * self.samples * np.log(fit.variance / better.variance))
 
 
-def stick_slip(u: FloatArray, static: FloatArray, kinetic: FloatArray) -> FloatArray:
+def stick_slip(u: FloatArray, static: FloatArray, kinetic: FloatArray, first: FloatArray) -> FloatArray:
     """Return the position of a sticking valve for each pair of parameters, shape (lanes, N).
 
     The valve moves to u -+ f_D once |u - x| exceeds f_S; S = f_S + f_D and J = f_S - f_D (He et al., 2007). f_S = f_D
     is a dead band of the width 2 f_S.
     """
-    x = np.full(static.size, float(u[0]))
+    x = first
     out = np.empty((static.size, u.size))
     for k, now in enumerate(u.tolist()):
         off = now - x
@@ -81,16 +82,27 @@ def compare_models(u: FloatArray, y: FloatArray, period: float, scales: Sequence
     """
     low, high = np.quantile(u, [0.01, 0.99])
     span = max(float(high - low), 1e-12)
-    grid = np.array([(s * span, j * s * span) for s in SIZES for j in JUMPS])
+    bands = np.array([(s * span, 0.0, 0.0) for s in SIZES_OF_BAND])
+    grid = np.array([(s * span, j, phase) for s in SIZES for j in JUMPS for phase in PHASES])
+    coarse = scales[min(1, len(scales) - 1)]  # where the likelihood is smooth, and cheap
+    kept = []
+    for scale, rounds in ((coarse, 2), (scales[0], 3)):
+        target = thin(y, scale)
+        delays = _delays(thin(u, scale), target, period / scale)
+        variances = _variances(u, grid, scale, target, delays)
+        steps = np.random.default_rng(0).standard_normal((STEPS, 3)) * SEARCH_STEP
+        for _ in range(rounds):
+            best = grid[np.argsort(variances)[:REFINED]]
+            near = (best[:, None, :] * np.exp(steps * (1.0, 0.0, 0.0)) + steps * (0.0, 1.0, 1.0)).reshape(-1, 3)
+            near[:, 1] = np.clip(near[:, 1], 0.1, 1.0)
+            near[:, 2] = np.clip(near[:, 2], -1.0, 1.0)
+            grid = np.concatenate([grid, near])
+            variances = np.r_[variances, _variances(u, near, scale, target, delays)]
+            steps = 0.5 * steps
+        grid = grid[np.argsort(variances)[: 8 * KEPT]]
+        kept.append(grid[:KEPT])
+    grid = np.concatenate([*kept, bands])
     lanes = _positions(u, grid)
-    probe = scales[min(1, len(scales) - 1)]  # where the likelihood is smooth, and cheap
-    averaged = thin(u, probe), thin(y, probe)
-    fits = fit_models(thin(lanes, probe), averaged[1], _delays(*averaged, period / probe))
-    ranked = sorted(np.flatnonzero(grid[:, 1] > 0.0).tolist(), key=lambda i: fits[i].variance)[:KEPT]
-    finer = np.array([grid[i] * (s, s * j) for i in ranked[:REFINED] for s in FINER_SIZES for j in FINER_JUMPS])
-    finer[:, 1] = np.minimum(finer[:, 1], finer[:, 0])
-    kept = [*ranked, *np.flatnonzero(grid[:, 1] == 0.0).tolist()]
-    lanes, grid = np.concatenate([lanes[kept], _positions(u, finer)]), np.concatenate([grid[kept], finer])
     edges = np.quantile(u, [*CLIPS, *(1.0 - q for q in CLIPS)])
     clipped = [np.minimum(u, edge) if i < len(CLIPS) else np.maximum(u, edge) for i, edge in enumerate(edges)]
     plain = np.stack([u, *clipped])
@@ -101,8 +113,14 @@ def compare_models(u: FloatArray, y: FloatArray, period: float, scales: Sequence
 
 
 def _positions(u: FloatArray, grid: FloatArray) -> FloatArray:
-    sizes, jumps = grid.T
-    return stick_slip(u, 0.5 * (sizes + jumps), 0.5 * (sizes - jumps))
+    sizes, jumps, phases = grid.T
+    jumps = sizes * jumps
+    static = 0.5 * (sizes + jumps)
+    return stick_slip(u, static, 0.5 * (sizes - jumps), u[0] + phases * static)
+
+
+def _variances(u: FloatArray, grid: FloatArray, scale: int, y: FloatArray, delays: npt.NDArray[np.int_]) -> FloatArray:
+    return np.array([fit.variance for fit in fit_models(thin(_positions(u, grid), scale), y, delays)])
 
 
 def _delays(u: FloatArray, y: FloatArray, period: float) -> npt.NDArray[np.int_]:
@@ -134,7 +152,7 @@ def _compare(
     linear, *clips = fit_models(plain, y, delays)
     (outside,) = fit_models(plain[:1], y, delays, np.stack([np.cos(wave), np.sin(wave)]))
     (alone,) = fit_models(np.zeros((1, y.size)), y, delays[-1:])
-    slips = [fit._replace(size=s, jump=j) for fit, (s, j) in zip(fits, grid.tolist(), strict=True)]
+    slips = [fit._replace(size=s, jump=s * j) for fit, (s, j, _) in zip(fits, grid.tolist(), strict=True)]
     return ModelComparison(
         alone,
         linear,

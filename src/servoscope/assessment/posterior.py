@@ -7,26 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import Literal, get_args
 
 import numpy as np
 from scipy import special
 
+from servoscope.assessment.causes import CAUSES, Cause
 from servoscope.core.arrays import FloatArray
 
-Cause = Literal[
-    "stiction",
-    "backlash",
-    "too tight",
-    "too sluggish",
-    "oscillation from outside",
-    "saturation",
-    "quantisation",
-    "frozen sensor",
-    "manual",
-    "good",
-]
-CAUSES: tuple[Cause, ...] = get_args(Cause)
 LIMIT = 3.0  # standard deviations at which a feature is clipped
 
 

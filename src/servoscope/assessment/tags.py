@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from servoscope.models.loop import Columns
 from servoscope.signals.readers.guess_columns import guess_mapping
@@ -13,6 +13,7 @@ SIGNALS = {
     **dict.fromkeys(("sp", "sv", "spt", "wsp", "setpoint", "r"), "reference"),
     **dict.fromkeys(("op", "mv", "co", "out", "output", "cv", "u"), "input"),
     **dict.fromkeys(("pv", "mes", "meas", "value", "y"), "output"),
+    **dict.fromkeys(("mode", "md", "mod"), "segment"),  # automatic, manual: each stretch counts by itself
 }
 
 
@@ -31,8 +32,14 @@ def find_loops(names: Sequence[str]) -> dict[str, Columns]:
         clock = {"time": guess["time"], "time_unit": guess["time_unit"]}
         loops = {tag: fields for tag, fields in tagged.items() if {"input", "output"} <= fields.keys()}
         if loops:
-            return {tag: Columns.model_validate({**clock, **fields}) for tag, fields in loops.items()}
-    return {"": Columns.model_validate({key: value for key, value in guess.items() if value is not None})}
+            return {tag: _form_columns({**clock, **fields}) for tag, fields in loops.items()}
+    mode = next((name for name in names if _split_tag(name.strip())[1] == "segment"), None)
+    return {"": _form_columns({**{key: value for key, value in guess.items() if value}, "segment": mode})}
+
+
+def _form_columns(fields: Mapping[str, str | None]) -> Columns:
+    segment = fields.get("segment")
+    return Columns.model_validate({**fields, "segment": (segment,) if segment is not None else ()})
 
 
 def _split_tag(name: str) -> tuple[str, str]:

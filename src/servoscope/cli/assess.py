@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator
+import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,11 +16,14 @@ from servoscope.cli.app import app
 from servoscope.cli.exit import FailureCounter, print_json
 from servoscope.cli.options import JsonOption, ReadingOptions, ReportOption, with_reading_options
 from servoscope.cli.output_paths import REPORTS, OutputPaths, check_output
-from servoscope.cli.progress import show_steps
+from servoscope.cli.progress import StepProgress, show_steps
 
 if TYPE_CHECKING:
-    from servoscope.assessment import Assessment
+    from servoscope.assessment.assess import Assessment
+    from servoscope.core.workers import Progress
     from servoscope.signals.samples import Samples
+
+MIN_FILES_PER_START = 16  # for which it pays to start processes
 
 
 @app.command()
@@ -43,8 +47,8 @@ def assess(
     check_output(work_list, "--csv", (".csv",), logs)
     limits = arguments.parse_range(travel, "--travel")
 
-    from servoscope.assessment import assess as assess_log
     from servoscope.assessment import plant_loops
+    from servoscope.assessment.assess import assess as assess_log
     from servoscope.cli.render import assessment, results
     from servoscope.core.files import atomic_write
     from servoscope.report import assessment_page
@@ -55,6 +59,10 @@ def assess(
     out, failures = results.create_console(), FailureCounter()
     judged: list[Assessment] = []
     with show_steps(len(logs), 2) as steps:
+        if pages is None and len(logs) >= MIN_FILES_PER_START:
+            for result in assess_files(logs, reader, limits, steps, failures):
+                judged.append(result)
+            logs = []
         for path in logs:
             steps.begin(path.name)
             with failures.catch():
@@ -79,6 +87,39 @@ def assess(
         atomic_write(work_list, text.getvalue().encode())
         results.print_written_path(results.create_console(stderr=as_json), work_list)
     failures.exit_if_any()
+
+
+def assess_files(
+    logs: Sequence[Path],
+    reader: arguments.RecordingReader,
+    travel: tuple[float, float] | None,
+    steps: StepProgress,
+    failures: FailureCounter,
+) -> Iterator[Assessment]:
+    """Yield the assessments of many files as they end, on all cores."""
+    from servoscope.assessment.assess import Assessment
+    from servoscope.core.workers import WorkerError, Workers
+
+    tasks = ((path, reader, travel) for path in logs)
+    for (path, *_), results in Workers().map(f"{__name__}:assess_file", tasks, os.cpu_count() or 1):
+        steps.begin(path.name)
+        with failures.catch():
+            if isinstance(results, WorkerError):
+                raise results
+            yield from map(Assessment.model_validate, results)
+
+
+def assess_file(
+    _: Progress, task: tuple[Path, arguments.RecordingReader, tuple[float, float] | None]
+) -> list[dict[str, Any]]:
+    """Assess the loops of one file, in a process of its own."""
+    from servoscope.assessment.assess import assess as assess_log
+
+    path, reader, travel = task
+    return [
+        assess_log(samples, name=name, travel=travel).model_dump(mode="json")
+        for name, samples in read_loops(path, reader)
+    ]
 
 
 def read_loops(path: Path, reader: arguments.RecordingReader) -> Iterator[tuple[str, Samples]]:

@@ -14,6 +14,7 @@ from servoscope.cli.app import app
 from servoscope.cli.exit import FailureCounter
 from servoscope.cli.options import ReadingOptions, with_reading_options
 from servoscope.cli.output_paths import check_output
+from servoscope.cli.progress import show_steps
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -49,7 +50,8 @@ def init(
     log, asks = logs[0], not yes and sys.stdin.isatty() and sys.stdout.isatty()
     reader = arguments.RecordingReader.from_options(None, reading)
     out = results.create_console()
-    with read_part(PART_ROWS):
+    with read_part(PART_ROWS), show_steps(1, 1) as steps:
+        steps.begin(log.name)
         channels = readers.list_channels(log, reader.text)
     if asks and reading.columns is None:
         results.print_channels(out, log, channels)
@@ -98,7 +100,9 @@ def _propose(out: Console, logs: list[Path], columns: Columns, output: Path, ask
     from servoscope.report.page import say
     from servoscope.signals import readers
 
-    proposal = propose_loop(logs, columns, where)
+    with show_steps(1, 1) as steps:
+        steps.begin(logs[0].name)
+        proposal = propose_loop(logs, columns, where)
     lines = [
         (f"{line.section}.{line.key}".lstrip("."), line.value + " ?" * line.doubtful, render(line.why))
         for line in proposal.lines
@@ -117,7 +121,9 @@ def _propose(out: Console, logs: list[Path], columns: Columns, output: Path, ask
     usable = []
     for log in logs:
         try:
-            found = inspection.inspect(readers.read(log, proposal.loop, where=where), proposal.loop)
+            with show_steps(1, 1) as steps:
+                steps.begin(log.name)
+                found = inspection.inspect(readers.read(log, proposal.loop, where=where), proposal.loop)
         except ServoscopeError:  # the notes say why
             continue
         results.print_inspection(out, found)

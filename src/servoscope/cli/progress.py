@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 import time
@@ -25,16 +26,23 @@ class StepProgress:
     def __init__(self, bar: Progress | None, parts: int, each: int) -> None:
         self._bar, self._each = bar, each
         self._task = bar.add_task("", total=parts * each) if bar is not None else None
-        self._part, self._steps_done, self._part_name, self._step = -1, 0, "", ""
+        self._part, self._steps_done, self._part_name, self._step, self._share = -1, 0, "", "", 0.0
 
     def begin(self, part: str) -> None:
         """Go on to the next part."""
-        self._part, self._steps_done, self._part_name, self._step = self._part + 1, 0, part, ""
+        self._part, self._steps_done, self._part_name, self._step, self._share = self._part + 1, 0, part, "", 0.0
         self._show()
 
     def advance(self, step: str) -> None:
         """Go on to the next step of the part."""
-        self._steps_done, self._step = min(self._steps_done + 1, self._each), step
+        self._steps_done, self._step, self._share = min(self._steps_done + 1, self._each), step, 0.0
+        self._show()
+
+    def count_rows(self, _: str, rows: int, share: float) -> None:
+        """Say how many rows of a file are read, and which share of it, where that is known."""
+        known = math.isfinite(share)
+        self._share = share if known and not self._steps_done else 0.0
+        self._step = f"{rows:,} rows".replace(",", " ") + (f", {share:.0%}" if known else "")
         self._show()
 
     @contextmanager
@@ -55,22 +63,24 @@ class StepProgress:
 
     def _show(self) -> None:
         if self._bar is not None and self._task is not None:
-            done = self._part * self._each + self._steps_done
+            done = self._part * self._each + self._steps_done + self._share
             self._bar.update(self._task, completed=done, description=self.describe())
 
 
 @contextmanager
 def show_steps(parts: int, each: int) -> Iterator[StepProgress]:
-    """Show a progress bar on stderr, if that is a terminal, and take it away again at the end; else lines."""
+    """Show a progress bar on stderr, if that is a terminal, and take it away again at the end; else lines.
+
+    While a file is read, it shows how many rows of it.
+    """
     from rich.progress import SpinnerColumn
+
+    from servoscope.signals.readers.table import watch_reading
 
     with _bar(SpinnerColumn()) as bar:
         steps = StepProgress(bar, parts, each)
-        if bar is None:
-            with _lines(steps.describe):
-                yield steps
-            return
-        yield steps
+        with nullcontext() if bar is not None else _lines(steps.describe), watch_reading(steps.count_rows):
+            yield steps
 
 
 @contextmanager

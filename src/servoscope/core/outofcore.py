@@ -77,6 +77,12 @@ def copy_column(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return copy
 
 
+def extremes(column: npt.NDArray[Any]) -> tuple[float, float]:
+    """Return the smallest and the largest value of a column of at least one row."""
+    bounds = [(column[rows].min(), column[rows].max()) for rows in iter_chunks(0, column.size, column)]
+    return float(min(low for low, _ in bounds)), float(max(high for _, high in bounds))
+
+
 def sample_chunks(rows: int) -> list[slice]:
     """Return slices, evenly spread, of about a million rows: enough to estimate a scale."""
     every = -(-rows // SAMPLE_ROWS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -36,6 +37,8 @@ from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Fault
 from servoscope.signals import Recording
+from servoscope.signals.readers import as_recording
+from servoscope.signals.readers.frames import Source
 from servoscope.simulation import reference as motion
 from servoscope.simulation import simulate
 from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD
@@ -48,8 +51,8 @@ Progress = Callable[[str], None]
 
 
 def design_study(
-    loop: Loop,
-    recordings: Sequence[Recording] = (),
+    loop: Loop | str | Path,
+    recordings: Sequence[Recording | Source] = (),
     *,
     reference: str | FloatArray = "profile",
     after_s: float = 30.0,
@@ -62,10 +65,11 @@ def design_study(
     Parameters
     ----------
     loop
-        Loop with a controller and a linear plant whose nominal values are known.
+        Loop with a controller and a linear plant whose nominal values are known, or its path.
     recordings
-        Healthy recordings: the baseline is learned from them, and their noise and the reference of the longest one are
-        used. Without any, one is simulated under `reference` with noise as given, and learned from.
+        Healthy recordings, or what `read` reads: the baseline is learned from them, and their noise and the reference
+        of the longest one are used. Without any, one is simulated under `reference` with noise as given, and learned
+        from.
     reference
         Kind of reference or file, as for `servoscope.simulation.reference`, or the reference itself, shape (N,), which
         is repeated as often as it takes.
@@ -83,13 +87,15 @@ def design_study(
     BaselineError, NotEnoughError, RecordingError, SimulationError
         If the baseline cannot be learned, or the reference does not fit.
     """
+    loop = Loop.of(loop)
     require_exact_predictor(loop)
     samples = round((BEFORE_S + after_s) * loop.sample_rate)
     if recordings:
-        longest = max(recordings, key=lambda rec: rec.samples)
+        healthy = [as_recording(one, loop) for one in recordings]
+        longest = max(healthy, key=lambda rec: rec.samples)
         progress("learning")
         return study(
-            learn_baseline(loop, recordings),
+            learn_baseline(loop, healthy),
             np.resize(longest.r, max(samples, 1)),
             after_s,
             reference=message("design.reference_of", recording=longest.name),

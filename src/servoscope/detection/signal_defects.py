@@ -77,7 +77,7 @@ def find_signal_defect(recording: Recording, delay_s: float = 0.0) -> SignalDefe
 
     `delay_s`: from u to y, by which a step of y that r asks for comes later.
     """
-    span = float(np.ptp(recording.y))
+    span = float(np.ptp(outofcore.extremes(recording.y)))
     settings = QualitySettings(frozen_s=FROZEN_S, frozen_travel=TRAVEL_SHARE * span or None)
     limits, state = settings.limits(recording.sample_rate), init_state()
     lead = LEAD_SAMPLES + round(delay_s * recording.sample_rate)
@@ -93,8 +93,8 @@ def find_signal_defect(recording: Recording, delay_s: float = 0.0) -> SignalDefe
 
 def find_switched_off(recording: Recording) -> SignalDefect | None:
     """Return from where on the drive is off: u stays at 0 for long while y moves, and not as r asks it to."""
-    u, span = recording.u, float(np.ptp(recording.y))
-    silent = SILENCE_SHARE * max(float(u.max()), -float(u.min()))
+    u, span = recording.u, float(np.ptp(outofcore.extremes(recording.y)))
+    silent = SILENCE_SHARE * float(np.abs(outofcore.extremes(u)).max())
     off = np.zeros(recording.samples, dtype=np.bool_)
     for rows in outofcore.iter_chunks(0, recording.samples, *recording.columns):
         off[rows] = (np.abs(u[rows]) <= silent) & ~recording.restart[rows]
@@ -227,7 +227,8 @@ def _frozen_defect(recording: Recording, finding: QualityFinding) -> SignalDefec
     begin = at
     while begin and x[begin - 1] == x[at]:
         begin -= 1
-    if name == "u" and not x.min() < x[at] < x.max():
+    low, high = outofcore.extremes(x)
+    if name == "u" and not low < x[at] < high:
         return None  # it is limited
     if name == "y" and _follows_late(recording, begin):
         return None
@@ -241,7 +242,7 @@ def _follows_late(recording: Recording, begin: int) -> bool:
 
     A rest before the command says nothing of the sensor, and a loop may take a while to break away.
     """
-    travel = TRAVEL_SHARE * float(np.ptp(recording.y))
+    travel = TRAVEL_SHARE * float(np.ptp(outofcore.extremes(recording.y)))
     moved = np.flatnonzero(recording.y[begin:] != recording.y[begin])
     end = begin + int(moved[0]) if len(moved) else recording.samples
     r = recording.r[begin:end]

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from servoscope.baseline.baseline import Baseline
+from servoscope.core import outofcore
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import RecordingError, SimulationError
 from servoscope.core.messages import Message, message
@@ -131,7 +132,7 @@ def _diagnose_at_point(
     baseline: Baseline, recording: Recording, progress: Callable[[str], None], point: str | None
 ) -> tuple[Diagnosis, Examination, BiasCorrection | None]:
     """Return the diagnosis at the operating point that explains the recording, and what its trace is made of."""
-    largest = max(float(max(x.max(), -x.min())) for x in (recording.r, recording.u, recording.y))
+    largest = max(abs(bound) for x in (recording.r, recording.u, recording.y) for bound in outofcore.extremes(x))
     if largest > MAX_SIGNAL:
         raise RecordingError(f"{recording.name}: has values up to {largest:.2g}, check the units of r, u and y")
     try:
@@ -167,7 +168,7 @@ def _judge_signals(
     hold_s, rate = baseline.loop.monitor.covariate_hold_s, recording.sample_rate
     if model is not None and (stale := model.describe_stale(recording.channels, hold_s, rate)) is not None:
         return leave_undetermined(exams[0], stale), exams[0], None
-    if recording.y.min() == recording.y.max():  # without the sensor's noise, which every likelihood divides by
+    if np.ptp(outofcore.extremes(recording.y)) == 0.0:  # without the sensor's noise, which every likelihood divides by
         return leave_undetermined(exams[0], message("warning.no_motion")), exams[0], None
     if (own := next(filter(None, map(examine_by_own_past, exams)), None)) is not None and own.alarm.any():
         diagnosis, correction = diagnose_examination(own, progress)

@@ -196,7 +196,8 @@ def _alarm_reason(exam: Examination, interval: FaultInterval) -> Message | None:
     if interval.candidates[0].name == VIBRATION:
         return message("diagnosis.alarm_vibration", t=interval.detected_at_s)
     # a change of an axis may be detected after the last evaluation
-    first = min(int(np.searchsorted(exam.t(slice(None)), interval.detected_at_s)), exam.evaluations - 1)
+    sample = np.searchsorted(exam.recording.t, interval.detected_at_s)
+    first = min(int(np.searchsorted(exam.estimates.index, sample)), exam.evaluations - 1)
     if exam.estimates.level[first] >= 1.0:
         return message("diagnosis.alarm_cusum", t=interval.detected_at_s)
     value, limit = float(exam.statistic[first]), exam.baseline.thresholds.statistic

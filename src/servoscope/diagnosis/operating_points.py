@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
@@ -20,7 +21,10 @@ from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 from servoscope.signals.readers import as_recording
 from servoscope.signals.readers.frames import Source
+from servoscope.signals.recording import thin_out
 
+MAX_SAMPLES = 400_000  # of all recordings, that are learned from: more take memory and time, and show little more
+MIN_MEMORIES = 10.0  # of the estimator, in a stretch of a long recording
 MIN_PROBABILITY_NOTED = 0.05  # probability from which a fault is noted that looks like another operating point
 
 
@@ -110,17 +114,39 @@ def learn(
     notes = {name: compare_with_earlier(compare, name, some, progress, accept_change) for name, some in named.items()}
     learned: list[Baseline] = []
     alikes = _named_machines(population)
-    for name, some in named.items():
+    for name, whole in named.items():
+        some = _thin_out(loop, whole)
         check_wraps(some)
         like = Population.from_baselines(_machines_at(alikes, name)) if alikes else None
         one = learning.learn_baseline(loop, some, progress, accept_delay, like)
         odd = check_plausibility(one, force or loop.implausible == "note")
         longest = max(some, key=lambda rec: rec.samples)
         progress("operating points")
+        rest = _judge_whole(one, whole, some)
         alike = [note for other in learned if (note := _resemblance_note(other, name, longest)) is not None]
-        one = one.model_copy(update={"point": name, "notes": (*odd, *one.notes, *notes[name], *alike)})
+        one = one.model_copy(update={"point": name, "notes": (*odd, *one.notes, *notes[name], *rest, *alike)})
         learned.append(learn_faults.add_learned_faults(one, labels[name], progress) if name in labels else one)
     return learned[0].model_copy(update={"others": tuple(learned[1:])})
+
+
+def _thin_out(loop: Loop, recordings: Sequence[Recording]) -> list[Recording]:
+    """Return recordings of a bounded length in all; long ones are stretches of what they were."""
+    share = MAX_SAMPLES / sum(rec.samples for rec in recordings)
+    if share >= 1.0:
+        return list(recordings)
+    # how a machine warms up shows in a whole beginning only
+    memories = math.inf if loop.monitor.hidden_warm_up else MIN_MEMORIES
+    shortest = round(min(memories * loop.monitor.memory * loop.sample_rate, MAX_SAMPLES))
+    return [thin_out(rec, math.ceil(share * rec.samples), shortest) for rec in recordings]
+
+
+def _judge_whole(baseline: Baseline, whole: Sequence[Recording], learned: Sequence[Recording]) -> list[Message]:
+    """Return what recordings are as a whole to a baseline that was learned from stretches of them."""
+    return [
+        message("learning.stretches", recording=one.name, rows=part.samples, of=one.samples, found=found.headline)
+        for one, part in zip(whole, learned, strict=True)
+        if part.samples < one.samples and (found := diagnose(baseline, one))
+    ]
 
 
 def _named_machines(population: Mapping[str, Baseline] | Sequence[Baseline | str | Path]) -> dict[str, Baseline]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from servoscope.assessment.assess import assess
 from servoscope.baseline.axis_model import AxisModel, AxisMoves
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.feature_model import FeatureModel
@@ -44,6 +45,14 @@ MAX_SIMULATED_SAMPLES = 2e6  # samples behind a nominal baseline
 Progress = Callable[[str], None]
 
 
+def doubt_healthy(recording: Recording) -> Message | None:
+    """Return that a recording shows a cause of poor control by itself, with near certainty, if it does."""
+    assessment = assess(recording)
+    if (cause := assessment.alarming_cause) is None:
+        return None
+    return message("learning.doubt", recording=recording.name, cause=cause, probability=assessment.probability)
+
+
 @with_one_blas_thread
 def learn_baseline(
     loop: Loop,
@@ -73,8 +82,9 @@ def learn_baseline(
         for check, reason in estimators.exceptions(name).items()
         if check in ("mean", "covariance")
     ]
+    doubts = [doubt for rec in recordings if (doubt := doubt_healthy(rec)) is not None]
     off = [defect.description for defect in map(find_switched_off, healthy.recordings) if defect is not None]
-    healthy = replace(healthy, notes=[*healthy.notes, *simplified, *notes, *off])
+    healthy = replace(healthy, notes=[*healthy.notes, *simplified, *notes, *doubts, *off])
     progress("healthy parameters")
     try:
         return _assemble_baseline(healthy, learn_plant(healthy), delay_s, progress)

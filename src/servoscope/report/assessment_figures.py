@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from matplotlib.figure import Figure
 
-from servoscope.assessment import Assessment
-from servoscope.assessment.assess import AssessedSignals
+from servoscope.assessment.assess import AssessedSignals, Assessment
 from servoscope.report.format_values import time_axis_unit
 from servoscope.report.plotting import COLOURS, envelope, plot_style
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from servoscope.assessment import Assessment
+from servoscope.assessment.assess import Assessment
 from servoscope.report.format_values import DASH, format_duration, format_percent
 from servoscope.report.page import ResultTable, render_page, say, write_page
 

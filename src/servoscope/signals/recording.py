@@ -8,11 +8,14 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from servoscope.core import outofcore
 from servoscope.core.arrays import Int32Array
 from servoscope.core.errors import RecordingError
 from servoscope.core.short_repr import ShortRepr
 from servoscope.signals.defects import Defect
 from servoscope.signals.samples import Samples
+
+MAX_STRETCHES = 8  # that stand for a long recording
 
 
 def frame_of(name: str, data: Any) -> Any:
@@ -97,6 +100,17 @@ class Recording(ShortRepr, Samples):
         restart[0] = True
         defects = tuple(d for d in self.defects if d.to_s >= from_s and d.from_s < to_s)
         return replace(part, restart=restart, run=part.run - part.run[0], defects=defects)
+
+
+def thin_out(recording: Recording, rows: int, shortest: int) -> Recording:
+    """Return stretches of a recording, evenly spread over it and of at least the shortest length, of so many rows."""
+    count = min(max(rows // max(shortest, 1), 1), MAX_STRETCHES)
+    length = rows // count
+    starts = np.linspace(0, recording.samples - length, count).astype(np.intp)
+    part = recording[(starts[:, None] + np.arange(length)).ravel()]
+    part.restart[::length] = True
+    outofcore.release(*recording.columns)
+    return part
 
 
 def with_defects(recording: Recording, *more: Defect) -> Recording:

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
-from servoscope.assessment import Assessment
+from servoscope.assessment.assess import Assessment
 from servoscope.assessment.plant_loops import group_by_period
 from servoscope.cli.render.results import INDENT, print_facts, print_notes, print_result_table, print_title
 from servoscope.core.messages import translate

@@ -13,6 +13,8 @@ from servoscope.signals import Recording
 MIN_COHERENCE = 0.8
 MIN_SEGMENTS = 4
 MIN_PERIODS = 3.5  # of the reference; with fewer, segments differ by what part of the motion they hold
+MAX_PERIODS_PER_SEGMENT = 2  # of more, the lines of a reference lie so far apart that no band holds them
+MIN_SEGMENT_SAMPLES = 512  # unless that many periods are shorter
 SILENT_POWER_SHARE = 1e-12  # share of the largest power below which r is said to have none
 
 
@@ -65,7 +67,8 @@ def spectra(recording: Recording, period: int | None = None) -> Spectra | None:
     stretches = list(zip(starts, np.append(starts[1:], recording.samples), strict=True))
     sizes = np.array([stop - start for start, stop in stretches])
     length = _length(sizes, recording.samples)
-    whole = (period or 0) * max(1, length // (period or 1))
+    few = max(MAX_PERIODS_PER_SEGMENT, MIN_SEGMENT_SAMPLES // (period or 1))
+    whole = (period or 0) * max(1, min(length // (period or 1), few))
     if whole >= 16 and sum(max(0, 2 * (size // whole) - 1) for size in sizes) >= MIN_SEGMENTS:
         length = whole
     if length < 16:

@@ -29,6 +29,7 @@ class AssetSnapshot:
     buffered: float | None = None  # share of the service's buffer that is filled; None: not the service
     connection: str | None = None  # what is wrong with a connection of the service; None: not a connection
     outlook: str | None = None  # whether the limit of its fault is ``near`` or ``reached``; None: it has none
+    control: str | None = None  # what is nearly certainly wrong with the control; "": nothing; None: not assessed
     outlook_cause: str = ""  # the prognosis in a sentence
     alarms: tuple[str, ...] = ()  # the asset's alarms whose condition is abnormal; `advance_alarms` fills it in
     cause: str = ""  # what transitions name as their cause, for example the diagnosis in a sentence
@@ -56,6 +57,8 @@ def evaluate_condition(definition: AlarmDefinition, abnormal: bool, snapshot: As
         return "unknown" if snapshot.connection is None else "abnormal" if snapshot.connection else "normal"
     if definition.source == "outlook":
         return "unknown" if snapshot.outlook is None else "abnormal" if snapshot.outlook in words else "normal"
+    if definition.source == "control":
+        return "unknown" if snapshot.control is None else "abnormal" if snapshot.control in words else "normal"
     value: float | None = getattr(snapshot, definition.source)
     if value is None or math.isnan(value):
         return "unknown"
@@ -72,6 +75,8 @@ def describe_cause(definition: AlarmDefinition, snapshot: AssetSnapshot) -> str:
         return snapshot.connection or ""
     if definition.source == "outlook":
         return snapshot.outlook_cause
+    if definition.source == "control":
+        return render(message("alarm.cause_control", cause=snapshot.control or ""))
     if definition.source == "statistic" and snapshot.statistic is not None:
         return render(message("alarm.cause_statistic", ratio=snapshot.statistic))
     if definition.source == "level" and snapshot.level is not None:

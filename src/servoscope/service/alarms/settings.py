@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
+from servoscope.assessment.causes import CAUSES, POOR_CONTROL
 from servoscope.core.messages import message, render
 from servoscope.core.settings import Finite, NonNegative, Positive, Settings
 from servoscope.core.settings_errors import describe_error
@@ -16,7 +17,9 @@ from servoscope.signals.quality import KINDS
 
 StrictText = Annotated[str, Field(strict=True)]
 
-AlarmSource = Literal["verdict", "quality", "reception", "outlook", "statistic", "level", "buffered", "connection"]
+AlarmSource = Literal[
+    "verdict", "quality", "reception", "outlook", "statistic", "level", "control", "buffered", "connection"
+]
 Priority = Literal["low", "medium", "high", "critical"]
 Ne107 = Literal["good", "maintenance_required", "out_of_specification", "function_check", "failure"]
 
@@ -25,11 +28,11 @@ ALARM_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 SERVICE_SOURCES: tuple[AlarmSource, ...] = ("buffered", "connection")  # sources of the service itself
 SOURCE_WORDS: dict[str, tuple[str, ...]] = {
     "verdict": ("fault", "undetermined"), "quality": KINDS, "reception": STATES, "connection": ("trouble",),
-    "outlook": ("near", "reached"),
+    "outlook": ("near", "reached"), "control": CAUSES,
 }  # fmt: skip
 ABNORMAL_WORDS: dict[str, tuple[str, ...]] = {  # where `when` says nothing
     "verdict": ("fault",), "quality": KINDS, "reception": ALARMED_STATES, "connection": ("trouble",),
-    "outlook": ("near", "reached"),
+    "outlook": ("near", "reached"), "control": POOR_CONTROL,
 }  # fmt: skip
 
 
@@ -39,7 +42,8 @@ class AlarmDefinition(Settings):
     enabled: Annotated[bool, Field(strict=True)] = True  # whether there is this alarm at all
     # the ``verdict``, the findings of data ``quality``, how samples come in (``reception``), when a fault reaches its
     # limit (``outlook``, of assets that have a limit), the ``statistic`` T^2 or
-    # the sequential test's ``level`` as multiples of their limits; of the service itself the share of the buffer that
+    # the sequential test's ``level`` as multiples of their limits, or the cause of poor ``control`` that the last
+    # minutes show without a baseline (`servoscope assess`); of the service itself the share of the buffer that
     # waits to be stored, ``buffered``, and the ``connection`` of each source and outlet
     source: AlarmSource
     # words of the source that are abnormal, where it has words; None: ``fault``, any finding, any trouble

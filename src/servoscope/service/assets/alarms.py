@@ -41,6 +41,7 @@ class AssetAlarms:
     def __init__(self, settings: AlarmSettings, ahead_s: float, *, limited: bool) -> None:
         alarms = settings.asset_alarms.items()
         self.definitions = {key: one for key, one in alarms if limited or one.source != "outlook"}
+        self.assesses = any(one.source == "control" for one in self.definitions.values())
         self._ahead_s = ahead_s
         self._settled: AlarmStandstill | None = None
         self._by_numbers = any(one.source in ("statistic", "level") for one in self.definitions.values())

@@ -362,7 +362,7 @@ class Asset(StateHolder):
         """Examine the last minutes if that is due, and request a full diagnosis of a new fault."""
         state, settings = self.take_state(), self.policy.diagnosis
         t, known = state.position.t, state.examination
-        details = state.evaluation.features, single_fault(known.faults), known.verdict
+        details = state.evaluation.features, single_fault(known.faults), known.verdict, self._alarms.assesses
         if is_at_rest(known, t, state.evaluation.exceeded):
             return
         recent = partial(self._window.after, t - settings.window_s)

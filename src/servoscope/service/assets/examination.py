@@ -39,6 +39,7 @@ class StoredDiagnosis(BaseModel):
     document: dict[str, Any] = {}  # of a diagnosis: as `diagnose --json` prints it
     # whether an alarm has gone that is still in the window: until it has left it, the window proves nothing
     recovering: bool = False
+    control: str | None = None  # the nearly certain cause of poor control, "" for none; None: not assessed
     size: FaultEstimate | None = None  # of the fault that was named before, as it is now; None: not known
 
     @property
@@ -87,16 +88,20 @@ def examine_blocks(
     features: float | None = None,
     fault: str | None = None,
     known: Verdict | None = None,
+    assess: bool = False,
 ) -> StoredDiagnosis:
     """Examine the last minutes with the reference that was applied in them, without a refit.
 
     `features`: their score in the monitor, as a multiple of its limit. It has seen more spans than the last minutes
     hold, so its word counts where the coefficients are healthy. `fault`: the one that was named, to follow its size.
     `known`: the verdict that the store has already: the same one again has no document, which takes as long as the rest
-    of the diagnosis.
+    of the diagnosis. `assess`: whether to say what is wrong with the control, too.
 
     Where the samples cannot be used, the verdict is ``undetermined`` and the headline has the reason.
     """
+    if assess:
+        result = examine_blocks(baseline, name, blocks, features, fault, known)
+        return result.model_copy(update={"control": _assess_blocks(baseline, name, blocks)})
     from servoscope.diagnosis.diagnose import diagnose_examination, judge_without_alarm
     from servoscope.diagnosis.examine import Examination
 
@@ -126,6 +131,20 @@ def examine_blocks(
     headline = message("service.examination.fault")
     size = _follow_size(exam, fault, first) if fault is not None else None
     return StoredDiagnosis(verdict="fault", headline=headline, onset=onset, size=size)
+
+
+def _assess_blocks(baseline: Baseline, name: str, blocks: Sequence[Block]) -> str | None:
+    """Return the cause of poor control that the last minutes show with near certainty, "" if none.
+
+    None where the samples cannot be used, or do not suffice.
+    """
+    from servoscope.assessment.assess import assess
+
+    try:
+        assessment = assess(blocks_to_recording(baseline, name, blocks)[0])
+    except ServoscopeError:
+        return None
+    return assessment.alarming_cause or (None if assessment.verdict == "cannot tell" else "")
 
 
 def compile_examination(baseline: Baseline) -> None:

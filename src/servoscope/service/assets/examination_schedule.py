@@ -59,6 +59,7 @@ class ExaminationState:
     # size, sized: the newest size of the fault, by an examination, and when that was [UTC s]; {}: no such size yet
     size: dict[str, Any] = field(default_factory=dict)
     sized: float | None = None
+    control: str | None = None  # the cause of poor control, "" for none; None: not assessed
 
     @classmethod
     def begin(cls, t: float, settings: DiagnosisSettings, phase: float, assets: int = 1) -> ExaminationState:
@@ -142,6 +143,7 @@ def update_examination(
         fault_at=t if faulty and sound else state.fault_at if faulty or stands else None,
         diagnosed=state.diagnosed if faulty or stands else None,
         size=result.size.model_dump(mode="json") if result.size else state.size if faulty or stands else {},
+        control=result.control,
         sized=t if result.size else state.sized if faulty or stands else None,
     )
     return new, result

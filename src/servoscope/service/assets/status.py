@@ -168,6 +168,7 @@ def asset_snapshot(
         statistic=statistic,
         level=level,
         reception=reception,
+        control=state.examination.control,
         cause=asset_summary(state.examination, findings),
         outlook=outlook,
         outlook_cause=current.summary if current is not None else "",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -14,12 +14,14 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from servoscope.core.errors import RecordingError
+from servoscope.models.loop import TextLayout
 from servoscope.signals.readers.table import Table, TableFile
 
 ENTRY_POINTS = "servoscope.tables"  # name is what an address begins with, object a function from address to table
 BUILT_IN = tuple(  # written like the entry points of other packages, and loaded like them
     EntryPoint(name, f"servoscope.signals.readers.{value}", ENTRY_POINTS)
     for name, value in (
+        ("join", "joined:open_joined"),
         ("sql", "sql:open_sql"),
         ("influx", "influx:open_influx"),
         ("delta", "lake_tables:open_delta"),
@@ -39,6 +41,7 @@ class TableAddress:
     since: str | None = None  # since, until: rows to take, by the time column: from here on, and before
     until: str | None = None
     time: str | None = None  # the time column, where it is called otherwise
+    text_layout: TextLayout | None = None  # what the user says of the layout of text files
 
     def time_column(self, columns: Sequence[str]) -> str | None:
         """Return the column in whose order the rows are; None where there is none.
@@ -110,7 +113,7 @@ def _find_opener(text: str) -> EntryPoint | None:
     return {each.name: each for each in (*entry_points(group=ENTRY_POINTS), *BUILT_IN)}.get(scheme)
 
 
-def open_address(text: str) -> TableFile | None:
+def open_address(text: str, layout: TextLayout | None = None) -> TableFile | None:
     """Open a table by its address, None where the text is none.
 
     Raises RecordingError if the table cannot be read.
@@ -118,5 +121,5 @@ def open_address(text: str) -> TableFile | None:
     found = _find_opener(text)
     if found is None:
         return None
-    opened: TableFile = found.load()(parse_address(text))
+    opened: TableFile = found.load()(replace(parse_address(text), text_layout=layout))
     return opened

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import re
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
@@ -23,7 +24,8 @@ FIELDS = {
     "segment": "segment",
 }
 ALLOWED_EXPRESSIONS = (
-    "only sums of channels and numbers, times or divided by numbers, are understood, and channel % range where it wraps"
+    "only sums of channels and numbers, times or divided by numbers, are understood, channel % range where it wraps,"
+    " and one | other where files differ"
 )
 MAX_SHOWN = 12
 HEADER_HINT = "; if a line of it has their names, say --header-row"
@@ -92,18 +94,20 @@ def parse_fields(text: str) -> dict[str, object]:
 
 
 def find_channel(name: str, known: Iterable[str], where: str) -> str:
-    """Return the channel called `name`.
+    """Return the channel called `name`; of alternatives, ``"Position | ActPos"``, the first that there is.
 
     `where`: how errors begin, for example ``file.csv: [columns] output``. Raises RecordingError if there is none, with
     the nearest names, or all of them, and how to name columns where none were named.
     """
     known = list(known)
     name = _strip_backticks(name)
-    if name in known:
-        return name
-    near = closest_names(name, known, count=3)
+    chosen = next((each for each in (name, *map(_strip_backticks, name.split("|"))) if each in known), None)
+    if chosen is not None:
+        return chosen
     defaults = Columns()
     key = where.rpartition("[columns] ")[2]
+    other = guess_mapping(known).get(key)
+    near = list(dict.fromkeys([*closest_names(name, known, count=3), *filter(None, [other])]))
     if not near and name == getattr(defaults, key if key in Columns.model_fields else "name", None):
         where = where.removesuffix(f": [columns] {key}")
         hint = f"say where the signals stand: {mapping_template(guess_mapping(known))} or [columns] in the loop file"
@@ -112,6 +116,8 @@ def find_channel(name: str, known: Iterable[str], where: str) -> str:
         raise RecordingError(f"{where}: {name_}" + (", ..." if len(known) > MAX_SHOWN else "") + unnamed)
     shown = ", ".join(near or known[:MAX_SHOWN]) + (", ..." if not near and len(known) > MAX_SHOWN else "")
     hint = f"did you mean {shown}?" if near else f"the file has {shown or 'none'}"
+    if other is not None:
+        hint += f" Where files differ, write {name} | OTHER"
     raise RecordingError(f"{where}: no column {name!r}, {hint}")
 
 
@@ -119,9 +125,9 @@ def parse_combination(text: str, known: Iterable[str], where: str) -> LinearComb
     """Read a channel's name or a linear combination, such as ``"0.025 * counts + 3"``.
 
     Names with blanks or odd characters are put in backticks inside combinations: "-`motor speed`/2". A text that is the
-    name of a channel is that channel. "counts % 65536" is a channel that wraps in a range of 65536, unwrapped. `where`:
-    how errors begin. Raises LoopError if the text is not a linear combination, RecordingError if a channel does not
-    exist.
+    name of a channel is that channel. "counts % 65536" is a channel that wraps in a range of 65536, unwrapped;
+    "Position | ActPos" is the first of them that there is. `where`: how errors begin. Raises LoopError if the text is
+    not a linear combination, RecordingError if a channel does not exist.
     """
     known = list(known)
     stripped = text.strip()
@@ -163,6 +169,10 @@ def _evaluate(node: ast.expr, quoted: Mapping[str, str], known: list[str], where
         return _evaluate(node.operand, quoted, known, where).scale(-1.0 if isinstance(node.op, ast.USub) else 1.0)
     if not isinstance(node, ast.BinOp):
         raise ValueError("not linear")
+    if isinstance(node.op, ast.BitOr):
+        with contextlib.suppress(RecordingError):
+            return _evaluate(node.left, quoted, known, where)
+        return _evaluate(node.right, quoted, known, where)
     left, right = (_evaluate(side, quoted, known, where) for side in (node.left, node.right))
     if isinstance(node.op, ast.Add):
         return left + right

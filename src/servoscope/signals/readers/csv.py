@@ -143,7 +143,8 @@ def read_csv(path: Path, layout: CsvLayout, wanted: Sequence[str], texts: Collec
     `wanted`: names of the columns that are read; `texts`: names of those that are text even where they look like
     numbers; raises RecordingError if it is not a table.
     """
-    rows = broken = 0
+    rows = broken = done = 0
+    size, width = path.stat().st_size, 2 if "16" in layout.encoding else 1
     odd: tuple[int, int] | None = None
     for text, before, last in _iter_text_chunks(path, layout):
         skip_rows = 0 if before else layout.skip_rows
@@ -151,7 +152,8 @@ def read_csv(path: Path, layout: CsvLayout, wanted: Sequence[str], texts: Collec
             continue
         columns, torn = _parse_chunk(path, layout, wanted, texts, text, skip_rows)
         told = [(number - skip_rows - 1 - index, before + number, line) for index, (number, _, line) in enumerate(torn)]
-        table = Table(path.name, columns, before + skip_rows + 1, tuple(told))
+        done += len(text) * width
+        table = Table(path.name, columns, before + skip_rows + 1, tuple(told), min(done / size, 1.0))
         rows, broken = rows + table.rows, broken + len(torn)
         odd = odd or next(((before + number, actual) for number, actual, _ in torn), None)
         if last and odd is not None and broken > max(1, MAX_BROKEN_SHARE * rows):

@@ -122,7 +122,7 @@ def open_file(path: str | Path, text: TextLayout | None = None) -> TableFile:
 
     Raises RecordingError if the file cannot be read, is empty, or is not what its suffix says.
     """
-    path, table = Path(path), open_address(str(path))
+    path, table = Path(path), open_address(str(path), text)
     if table is not None:
         return table
     if path.is_dir():

@@ -31,7 +31,8 @@ def open_parquet(path: Path) -> TableFile:
             with pq.ParquetFile(path, buffer_size=BUFFER_BYTES, pre_buffer=False) as file:
                 for batch in file.iter_batches(CHUNK_ROWS, columns=list(wanted)):
                     columns = {name: pa.chunked_array([batch.column(name)]) for name in wanted}
-                    yield Table(path.name, columns, first)
+                    share = (first - 1 + batch.num_rows) / file.metadata.num_rows
+                    yield Table(path.name, columns, first, share=share)
                     first += batch.num_rows
         except (pa.ArrowException, OSError) as error:
             raise damaged(error) from None

@@ -322,9 +322,8 @@ class LoggedRows:
         (t, *signals), run, channels = self.split_columns()
         axis = build_time_axis(t, run, self._rate, self.name)
         r, u, y = map(axis.reorder, signals)
-        return Samples.from_columns(
-            axis.t, r, u, y, channels={name: axis.reorder(channel) for name, channel in channels.items()}
-        )
+        others = {name: axis.reorder(channel) for name, channel in channels.items()}
+        return Samples.from_columns(axis.t, r, u, y, np.diff(axis.run, prepend=0) > 0, others)
 
     def dated_recording(self, log: Log) -> Recording:
         """Return the rows cleaned; time stamps that are seconds since 1970 count from the first of them."""

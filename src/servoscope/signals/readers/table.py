@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -34,6 +35,7 @@ class Table:
     first_row: int = 1  # number of the first row in the file, as an editor counts
     # rows that could not be split into the columns: (rows read before it, number in the file, text)
     broken: tuple[tuple[int, int, str], ...] = ()
+    share: float = math.nan  # of the file, that has been read with it; NaN where nobody knows
 
     @property
     def rows(self) -> int:
@@ -247,6 +249,8 @@ class TableFile:
                 part.cut[self.name] = rows
                 break
             rows += table.rows
+            if (watch := _watch.get()) is not None:
+                watch(self.name, rows, table.share if part is None else min(rows / part.rows, 1.0))
             if table.rows and also:
                 table = replace(table, columns={**table.columns, **{a: table.columns[n] for a, n in also.items()}})
             if table.rows:
@@ -274,6 +278,19 @@ def read_part(rows: int) -> Iterator[Part]:
         yield part
     finally:
         _part.reset(before)
+
+
+_watch: ContextVar[Callable[[str, int, float], None] | None] = ContextVar("watch", default=None)
+
+
+@contextmanager
+def watch_reading(watch: Callable[[str, int, float], None]) -> Iterator[None]:
+    """Call with name, rows and share of a file as they are read, in this thread for a while."""
+    before = _watch.set(watch)
+    try:
+        yield
+    finally:
+        _watch.reset(before)
 
 
 def shorten_error(error: Exception) -> str:
