@@ -354,7 +354,7 @@ def test_every_row_counts_once_whatever_overlaps_and_whenever_it_is_killed(
             time.sleep(0.002)
         press.kill()
     source = press.open()
-    press.until(lambda: source.pause_s < np.inf)
+    press.until(lambda: source.pause_s < np.inf and press.rows_of() == expected)  # at rest before it has begun, too
     press.kill()
     counted = press.rows_of()
     assert counted == sorted(set(counted)), "each at most once, in order"

@@ -61,6 +61,13 @@ class AxisModel(BaseModel):
         known = {name: float(std[name]) * abs(self.coefficients[name]) for name in self.parameters}
         return np.array([(known | self.unseen | {"offset": self.offset_std}).get(name, 0.0) for name in names])
 
+    def with_scatter(self, earlier: AxisModel) -> AxisModel:
+        """Return the axis with the relative scatter of an earlier one, where that is larger."""
+        C, known = np.array(self.covariance), dict(zip(earlier.parameters, earlier.covariance, strict=True))
+        for i, name in enumerate(self.parameters):
+            C[i, i] = max(C[i, i], known[name][earlier.parameters.index(name)] if name in known else 0.0)
+        return self.model_copy(update={"covariance": tuple(map(tuple, C.tolist()))})
+
     def visible_faults(self, faults: Sequence[Fault]) -> tuple[Fault, ...]:
         """Return those faults that multiply something that the healthy recordings show."""
         both = {"viscous_friction": BY_DIRECTION} if "viscous_friction" not in self.coefficients else {}

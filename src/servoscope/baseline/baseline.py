@@ -47,6 +47,7 @@ from servoscope.models.plants import Plant
 FORMAT = "servoscope-baseline"
 ARM_FORMAT = "servoscope-arm-baseline"  # what `ArmBaseline` writes
 VERSION = 3
+SETTLED_MEMORIES = 3.0  # memories, after which 5 % of the start are left
 
 
 class Baseline(ShortRepr, BaselineMemory):
@@ -282,6 +283,24 @@ class Baseline(ShortRepr, BaselineMemory):
     def covariance_array(self) -> FloatArray:
         """Return `covariance` as an array (n, n)."""
         return np.array(self.covariance)
+
+    def covariance_after(self, updates: FloatArray) -> FloatArray:
+        """Return `covariance` after so many updates of the recursion, shape (n, n) or (..., n, n): see `transient`."""
+        C, transient = self.covariance_array(), self.scatter.transient
+        if not transient:
+            return C
+        settled = np.asarray(updates)[..., None, None] > self.settled_after
+        return np.where(settled, C - np.diag(transient), C)
+
+    @property
+    def scatter_from(self) -> int:
+        """Recordings that its scatter is known from, its own or those of an earlier baseline."""
+        return max(len(self.sources), self.scatter.carried_from)
+
+    @property
+    def settled_after(self) -> float:
+        """Updates after which the recursion has forgotten its start."""
+        return SETTLED_MEMORIES * self.pipeline().memory
 
     def save(self, path: str | Path) -> None:
         """Write the baseline as JSON; nothing half-written stays behind.

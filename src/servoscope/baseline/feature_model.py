@@ -95,6 +95,36 @@ class FeatureModel(_FeatureRecord):
         in_a_row = spans_in_a_row(self.layout, self.false_alarms, false_alarms_per_year)
         return self.model_copy(update={"in_a_row": in_a_row})
 
+    def with_scatter(self, earlier: FeatureModel | None) -> Self | None:
+        """Return the model with an earlier one's recordings, moved to the mean of its own, and the larger limits.
+
+        None where the earlier one has other features: a short stretch alone does not show how healthy days differ.
+        """
+        if (
+            earlier is None
+            or earlier.covariates
+            or (earlier.layout.bands_hz, earlier.layout.edges_s)
+            != (
+                self.layout.bands_hz,
+                self.layout.edges_s,
+            )
+        ):
+            return None
+        known = {(group.level, group.past, group.kept): np.array(group.means) for group in earlier.groups}
+        groups = []
+        for group in self.groups:
+            own, before = np.array(group.means), known.get((group.level, group.past, group.kept))
+            if before is None:
+                return None
+            moved = before - before.mean(axis=0) + own.mean(axis=0)
+            groups.append(group.model_copy(update={"means": to_tuples(np.vstack([moved, own]))}))
+        limits = {
+            "limit": max(self.limit, earlier.limit),
+            "past_limit": max(self.past_limit, earlier.past_limit) if self.compares_past else 0.0,
+        }
+        left_out = (*earlier.left_out, *self.left_out)
+        return self.model_copy(update={"groups": tuple(groups), "left_out": left_out, **limits})
+
     def at(self, covariates: FloatArray) -> Self:
         """Return the model at some covariates (k,), which recordings need not have then."""
         if not self.covariates:

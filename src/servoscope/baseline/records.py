@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from servoscope.baseline.hypothesis import CusumHypothesis
 from servoscope.baseline.threshold import CalibrationFactors
@@ -142,6 +142,13 @@ class HealthyScatter(BaselineModel):
     # covariance (n, n) of the coefficients between them beyond their noise; empty where there was one recording
     between: Matrix = ()
     left_out: Vector = ()  # largest T^2 of each over its limit when learned without it; empty of less than four
+    # variances (n,) of a further recording beyond its noise that a baseline before this one had learned, at the present
+    # coefficients, and from how many recordings; they count until this one has learned from as many
+    carried: Vector = Field(default=(), exclude_if=lambda value: not value)
+    carried_from: int = Field(default=0, exclude_if=lambda value: not value)
+    # part (n,) of the covariance's diagonal for what the scatter does while the recursion forgets its start: it counts
+    # until the estimate has settled
+    transient: Vector = Field(default=(), exclude_if=lambda value: not value)
 
 
 class AlarmThresholds(BaselineModel):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,6 +22,7 @@ from servoscope.cli.progress import StepProgress, show_steps
 if TYPE_CHECKING:
     from servoscope.assessment.assess import Assessment
     from servoscope.core.workers import Progress
+    from servoscope.models.loop import Columns
     from servoscope.signals.samples import Samples
 
 MIN_FILES_PER_START = 16  # for which it pays to start processes
@@ -126,13 +128,36 @@ def read_loops(path: Path, reader: arguments.RecordingReader) -> Iterator[tuple[
     """Yield the loops in a file with their names: by the mapping, or by the names of its columns."""
     from servoscope.assessment.tags import find_loops
     from servoscope.signals.readers.frames import open_source
-    from servoscope.signals.readers.recording_file import read_rows
 
     given = reader.columns
     loops = {"": given} if given is not None else find_loops(open_source(path, reader.text).columns)
     first, last = reader.span
+    for name, tag, samples in read_tags(path, loops, reader):
+        rows = samples if reader.span == arguments.UNBOUNDED else samples[(samples.t >= first) & (samples.t < last)]
+        yield f"{name}[{tag}]" if len(loops) > 1 else name, rows
+
+
+def read_tags(
+    path: Path, loops: Mapping[str, Columns], reader: arguments.RecordingReader
+) -> Iterator[tuple[str, str, Samples]]:
+    """Yield name, tag and samples of loops that share a file; it is read once for all that have no modes."""
+    from servoscope.signals.readers.recording_file import read_rows
+
+    plain = {tag: columns for tag, columns in loops.items() if not columns.segment}
     for tag, columns in loops.items():
-        columns = columns.model_copy(update={"text": reader.text or columns.text})
-        for name, samples in read_rows(path, columns, reader.where, reader.by).items():
-            rows = samples if reader.span == arguments.UNBOUNDED else samples[(samples.t >= first) & (samples.t < last)]
-            yield f"{name}[{tag}]" if len(loops) > 1 else name, rows
+        if columns.segment or len(plain) == 1:
+            columns = columns.model_copy(update={"text": reader.text or columns.text})
+            for name, samples in read_rows(path, columns, reader.where, reader.by).items():
+                yield name, tag, samples
+    if len(plain) > 1:
+        signals = {
+            x for columns in plain.values() for x in (columns.reference, columns.input, str(columns.output)) if x
+        }
+        some = next(iter(plain.values()))
+        whole = some.model_copy(update={"text": reader.text or some.text, "covariates": {x: x for x in signals}})
+        for name, samples in read_rows(path, whole, reader.where, reader.by).items():
+            channels = samples.channels
+            for tag, columns in plain.items():
+                u, y = channels[columns.input], channels[str(columns.output)]
+                r = channels[columns.reference] if columns.reference else u
+                yield name, tag, replace(samples, r=r, u=u, y=y, channels={})

@@ -39,7 +39,7 @@ def relearn(
     from servoscope.cli.render import results
     from servoscope.cli.service import open_store
     from servoscope.diagnosis.relearn import relearn as learn_anew
-    from servoscope.service import relearning
+    from servoscope.service import renewal
     from servoscope.service.assets.status import AssetStatus
     from servoscope.service.config import ServiceFile
 
@@ -48,11 +48,11 @@ def relearn(
     t, who, path = status.position.t, who or getpass.getuser(), settings.baseline_file(asset)
     before = Baseline.load(path)
     if back:
-        print_difference(before, relearning.go_back(settings, store, asset, who, why, t), as_json)
+        print_difference(before, renewal.go_back(settings, store, asset, who, why, t), as_json)
         return
-    noted = relearning.learning_progress(settings, store, asset, status, before)
+    noted = renewal.learning_progress(settings, store, asset, status, before)
     begin = parse_time(since, "--since") if since is not None else noted.since
-    stretch = relearning.stored_stretch(settings, store, asset, before, begin, parse_time(until, "--to"))
+    stretch = renewal.stored_stretch(settings, store, asset, before, begin, parse_time(until, "--to"))
     with show_steps(1, 8) as steps:
         steps.begin(stretch.name)
         learned = learn_anew(
@@ -66,13 +66,13 @@ def relearn(
             leave_out=True,
             save=False,
         )
-    judged = relearning.judge_again(store, asset, before, learned, t)
+    judged = renewal.judge_again(store, asset, before, learned, t)
     print_difference(before, learned, as_json, {"judged": judged._asdict()})
     out = results.create_console(stderr=as_json)
     if not as_json:
         results.print_facts(
             out, [("past values beyond the limit", f"{judged.before} before, {judged.after} after, of {judged.values}")]
         )
-        results.print_notes(out, learned.notes)
+        results.print_notes(out, [*learned.notes, *renewal.offers(learned, status, settings.diagnosis.kept_s)])
     if yes:
-        results.print_written_path(out, relearning.put_in_force(settings, store, asset, learned, stretch, t))
+        results.print_written_path(out, renewal.put_in_force(settings, store, asset, learned, stretch, t))

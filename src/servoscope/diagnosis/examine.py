@@ -134,7 +134,8 @@ class Examination:
 
     def covariance(self, at: Any) -> FloatArray:
         """Return the covariance of theta_hat minus its expectation at some evaluations, shape (..., n, n)."""
-        return np.asarray(self.noise_growth * self.estimates.S[at] + self.baseline.covariance_array())
+        known = self.baseline.covariance_after(self.estimates.updates[at])
+        return np.asarray(self.noise_growth * self.estimates.S[at] + known)
 
     @property
     def ready(self) -> npt.NDArray[np.bool_]:
@@ -309,7 +310,7 @@ def _run_recursion(
 
     `run`: with the baseline's own sequential test; None: with limits for the recording's reference.
     """
-    tuning, C, noise, walk, watch = baseline.tuning, baseline.covariance_array(), None, None, None
+    tuning, noise, walk, watch = baseline.tuning, None, None, None
     if baseline.healthy.noise is not None:
         noise = baseline.healthy.noise.times(np.sqrt(growth))
     if run is not None:
@@ -334,10 +335,10 @@ def _run_recursion(
     columns = defaultdict[str, outofcore.GrowableArray](outofcore.GrowableArray)
 
     def keep(e: Estimates, path: Future[FloatArray]) -> None:
-        expected, covariance = np.broadcast_to(path.result(), e.theta.shape), C
+        expected, covariance = np.broadcast_to(path.result(), e.theta.shape), baseline.covariance_after(e.updates)
         if along is not None:
             expected = expected + (along.expected(e.index) - tuning.theta)
-            covariance = C + along.covariance(e.index)
+            covariance = covariance + along.covariance(e.index)
         T2 = np.where(e.updates > 0, t2_statistic(e.theta, expected, growth * e.S + covariance), 0.0)
         for name, piece in {**vars(e), "expected": expected, "statistic": T2}.items():
             columns[name].append(piece)

@@ -49,7 +49,9 @@ class MonitorConstants:
         frequencies, expected = baseline.loop.monitor.frequencies, np.array(baseline.theta) - baseline.bias
         E = pipeline.bank.E(frequencies)
         response = np.stack([E.real, E.imag], axis=1).reshape(2 * len(E), -1)
-        evaluation = EvaluationConstants(baseline.covariance_array(), expected, response, baseline.loop.sample_rate)
+        settled, rate = baseline.settled_after, baseline.loop.sample_rate
+        covariance = baseline.covariance_array(), baseline.covariance_after(np.array(np.inf))
+        evaluation = EvaluationConstants(covariance[0], expected, response, rate, covariance[1], settled)
         constants = pipeline.constants(baseline.tuning, cusum_constants(baseline, pipeline), evaluation)
         healthy = frequency_response.frequency_response(
             pipeline.bank, frequencies, expected, baseline.covariance_array()

@@ -16,7 +16,7 @@ from servoscope.diagnosis.learn_faults import LabelledRecordings
 from servoscope.learning import learn as learning
 from servoscope.learning.learn import Progress
 from servoscope.learning.plausibility import check_plausibility, check_wraps
-from servoscope.learning.population import Population
+from servoscope.learning.population import MIN_MACHINES, Population
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 from servoscope.signals.readers import as_recording
@@ -39,6 +39,7 @@ def learn(
     accept_delay: bool = False,
     force: bool = False,
     population: Mapping[str, Baseline] | Sequence[Baseline | str | Path] = (),
+    earlier: Baseline | None = None,
 ) -> Baseline:
     """Learn a baseline from healthy recordings, at one operating point or at several.
 
@@ -68,9 +69,12 @@ def learn(
         Learn although the coefficients are none that a machine has, or explain less than half of u; the notes then
         say so.
     population
-        Baselines of at least five like machines, or their paths, by name or in a list: how they differ is a prior, so
-        that a new machine needs less healthy data of its own. A machine that is none of them is learned without; the
-        notes say which it was.
+        Baselines of like machines, or their paths, by name or in a list. How five or more differ is a prior, so that a
+        new machine needs less healthy data of its own; a machine that is none of them is learned without, and the notes
+        say which it was. Of fewer, the one of most recordings is the `earlier` one.
+    earlier
+        A baseline of more recordings, from before a repair or of a copy of the machine: what it knows of how healthy
+        recordings scatter counts until this one has as many.
 
     Returns
     -------
@@ -114,11 +118,15 @@ def learn(
     notes = {name: compare_with_earlier(compare, name, some, progress, accept_change) for name, some in named.items()}
     learned: list[Baseline] = []
     alikes = _named_machines(population)
+    if len(alikes) < MIN_MACHINES:
+        earlier = max([*alikes.values(), *filter(None, [earlier])], key=lambda each: each.scatter_from, default=None)
+        alikes = {}
     for name, whole in named.items():
         some = _thin_out(loop, whole)
         check_wraps(some)
         like = Population.from_baselines(_machines_at(alikes, name)) if alikes else None
-        one = learning.learn_baseline(loop, some, progress, accept_delay, like)
+        before = earlier.at(name) if earlier is not None and name in earlier.points else earlier
+        one = learning.learn_baseline(loop, some, progress, accept_delay, like, before)
         odd = check_plausibility(one, force or loop.implausible == "note")
         longest = max(some, key=lambda rec: rec.samples)
         progress("operating points")

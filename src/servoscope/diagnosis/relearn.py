@@ -45,6 +45,7 @@ def relearn(
         The baseline file.
     recordings
         New healthy recordings, or what `read` reads; by the name of their operating point where the baseline has some.
+        Operating points without new ones stay as they are.
     progress
         Called with the name of each step.
     after
@@ -102,7 +103,8 @@ def relearn(
         if reference is not earlier:
             compare_with_earlier(reference, point, some, progress, accept_change or after is not None, "first")
     kept: dict[str, list[Recording]] = {}
-    for each in () if after in RENEWALS else earlier.per_point:
+    learned = {each.point: each for each in earlier.per_point if each.point in new}
+    for each in () if after in RENEWALS else learned.values():
         kept[each.point], missing = find_sources(each, folders)
         if missing and not leave_out:
             raise BaselineError(
@@ -110,9 +112,9 @@ def relearn(
                 "there, or learn from the new recordings alone (after a repair, for example)"
             )
         notes.setdefault(each.point, []).extend(message("learning.source_missing", recording=name) for name in missing)
-    together = {each.point: [*kept.get(each.point, ()), *new.get(each.point, ())] for each in earlier.per_point}
+    together = {point: [*kept.get(point, ()), *new[point]] for point in learned}
     chosen = together.get("", together)
-    baseline = learn(loop, chosen, progress, accept_delay=accept_delay, force=force)
+    baseline = learn(loop, chosen, progress, accept_delay=accept_delay, force=force, earlier=earlier)
     number = max(history) + 1
     changed = any(note.key == "learning.accepted" for some in notes.values() for note in some)
     revision = Revision(
@@ -124,10 +126,11 @@ def relearn(
         parent=known.number,
         reference=number if changed or after in RENEWALS else known.reference,
     )
-    points = [
-        each.model_copy(update={"notes": (*each.notes, *notes.get(each.point, ())), "learned": before.learned})
-        for each, before in zip(baseline.per_point, earlier.per_point, strict=True)
-    ]
+    for each in baseline.per_point:
+        before = learned[each.point]
+        update = {"notes": (*each.notes, *notes.get(each.point, ())), "learned": before.learned}
+        learned[each.point] = each.model_copy(update=update)
+    points = [learned.get(each.point, each) for each in earlier.per_point]
     baseline = points[0].model_copy(update={"others": tuple(points[1:]), "revision": revision})
     if save:
         replace_baseline(path, baseline)

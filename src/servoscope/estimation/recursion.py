@@ -43,13 +43,21 @@ class EvaluationConstants(NamedTuple):
     """Constants of complete evaluations; `response` holds Re and Im of E(f).
 
     `covariance` (n, n) and `origin` (n,) are the baseline's covariance and coefficients in physical units, `response`
-    has shape (2 F, n), and `rate` is that of the samples [Hz].
+    has shape (2 F, n), and `rate` is that of the samples [Hz]. After `settled` updates the covariance is
+    `settled_covariance`, where that is another one.
     """
 
     covariance: FloatArray
     origin: FloatArray
     response: FloatArray
     rate: float
+    settled_covariance: FloatArray
+    settled: float
+
+    @property
+    def fades(self) -> bool:
+        """Whether the covariance is another one once the estimate has settled."""
+        return not np.array_equal(self.covariance, self.settled_covariance)
 
 
 class RecursionConstants(NamedTuple):
@@ -264,7 +272,7 @@ def structure_key(c: RecursionConstants) -> Hashable:
     """Return the sizes and settings that assets of one fleet must have in common."""
     spec = _kernel_spec([c])
     together = spec.sizes.directions > 0
-    sizes = spec.sizes._replace(lags=0, memory=0, watched=0, floats=0, directions=0)
+    sizes = spec.sizes._replace(lags=0, memory=0, watched=0, floats=0, directions=0, fades=False)
     if together:  # their shadows are filled up to one size
         sizes = sizes._replace(shadow=0)
     return spec.estimator, sizes, together, spec.bank, c.stride, c.every, c.memory
@@ -286,6 +294,7 @@ def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
         speed = 2 if first.v_of_r else 1
     start = first.view is None
     frequencies = 0 if first.view is None else len(first.view.response) // 2
+    fades = any(c.view is not None and c.view.fades for c in constants)
     to = _offsets(
         {
             **{"power": 1, "drift": 1, "level": 1, "peak": 1, "x": len(first.bank.A), "velocity": 2 * bool(speed)},
@@ -308,6 +317,8 @@ def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
                 "rate": 0 if start else 1,
                 "response": frequencies * 2 * (n + 1),
                 "shapes": len(first.shapes),
+                "settled_prior": fades * n * n,
+                "settled": fades,
             },
         }
     )
@@ -330,6 +341,7 @@ def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
         row=5 + n + 2 * n * n if start else 4 + n + n * n + 6 * frequencies,
         floats=to["end"],
         directions=q,
+        fades=fades,
     )
     spec = KernelSpec(
         first.estimator, sizes, tuple(to.items()), tuple((*at.items(), ("tail", at["end"]))), bank, shadow
@@ -379,6 +391,8 @@ def _pack_constants(c: RecursionConstants, spec: KernelSpec) -> FloatArray:
             **{"prior": back @ view.covariance @ back.T, "origin": view.origin, "basis": c.basis, "rate": view.rate},
             "response": [np.concatenate([(e @ c.basis).ravel(), e @ view.origin]) for e in E],
         }
+        if spec.sizes.fades:
+            values |= {"settled_prior": back @ view.settled_covariance @ back.T, "settled": view.settled}
     row = np.zeros(places["tail"] + members.size)
     for name, value in values.items():
         row[places[name] : places[name] + np.size(value)] = np.ravel(value)

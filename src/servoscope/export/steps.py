@@ -59,7 +59,7 @@ class StepTracer:
         def evaluate(c: Any, s: Any, h: Any, q: Any) -> None:
             evaluation.write_evaluation(c, s, h, q)
             for f in range(size.frequencies):
-                evaluation.write_response(c, s, f, q)
+                evaluation.write_response(c, s, h, f, q)
 
         texts = {
             "begin_filters": self._trace(partial(steps.begin_filters, i=0), "c s h tile"),

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.plant_fit import can_simulate, fault_directions
 from servoscope.baseline.records import AlarmThresholds, Detectability, DetectableChange
 from servoscope.baseline.threshold import SECONDS_PER_YEAR, threshold
@@ -18,7 +19,7 @@ from servoscope.estimation.tuning import TuningFit
 from servoscope.learning.healthy_plant import PlantKnowledge
 from servoscope.learning.instrument import noise_moments
 from servoscope.learning.recursion import HealthyRecordings
-from servoscope.learning.scatter import HealthyPaths, Scatter
+from servoscope.learning.scatter import HealthyPaths, Scatter, forecast_covariance
 from servoscope.models.loop import Loop
 from servoscope.models.lti import solve_scaled
 
@@ -36,9 +37,10 @@ def learn_detectability(
     paths: HealthyPaths,
     scatter: Scatter,
     covariance: FloatArray,
+    transient: FloatArray,
     thresholds: AlarmThresholds,
 ) -> tuple[Detectability, list[Message]]:
-    """Judge what coefficients with a covariance (n, n) can show, and note what limits it."""
+    """Judge what coefficients with a covariance (n, n), of which a part fades, can show, and note what limits it."""
     loop, fit, monitor = healthy.loop, plant.fit, healthy.loop.monitor
     notes = noise_notes(healthy.pipeline, fit, paths.estimates, can_simulate(loop))
     excess, suggestion = baseline_misfit(paths.estimates, paths.deviations, covariance, fit)
@@ -57,7 +59,7 @@ def learn_detectability(
     directions = fault_directions(loop, plant.plant, scatter.theta)
     changes, without_scatter = (
         detectable_changes(loop, directions, paths.estimates, C, thresholds.statistic)
-        for C in (covariance, scatter.theta_covariance + scatter.error)
+        for C in (covariance - np.diag(transient), scatter.theta_covariance + scatter.error)
     )
     smallest, fault = _smallest_change(changes)
     if smallest >= MIN_USELESS_CHANGE:
@@ -70,6 +72,22 @@ def learn_detectability(
         supported_false_alarms_per_year=supported,
         changes=changes,
     ), notes
+
+
+def forecast_changes(baseline: Baseline, more: int) -> dict[str, tuple[float, float]]:
+    """Return the smallest detectable changes now and with `more` recordings like those before, by fault.
+
+    With forgetting, theta_hat has the covariance P_d/2; what is not detected now is left out.
+    """
+    S, directions = np.array(baseline.recursion.P_d) / 2.0, baseline.fault_directions
+    before, after = baseline.covariance_after(np.array(np.inf)), forecast_covariance(baseline, more)
+    found = {}
+    for change in baseline.detectability.changes:
+        d = directions[change.parameter]
+        if change.change is not None:
+            gain = (d @ solve_scaled(S + before, d)) / (d @ solve_scaled(S + after, d))
+            found[change.name] = change.change, change.change * float(np.sqrt(gain))
+    return found
 
 
 def _smallest_change(changes: Sequence[DetectableChange]) -> tuple[float, str]:

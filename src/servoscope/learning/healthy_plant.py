@@ -169,11 +169,12 @@ def _learn_noise(
 
 
 def learn_sequential_test(
-    healthy: HealthyRecordings, plant: PlantKnowledge
+    healthy: HealthyRecordings, plant: PlantKnowledge, scatters: bool = False
 ) -> tuple[CalibrationFactors, tuple[CusumHypothesis, ...], list[Message]]:
     """Design the sequential test where the physics hold, and count its false alarms and those of T^2.
 
-    It takes the parameters for constant: where they scatter, healthy recordings would be alarms.
+    It takes the parameters for constant: where they scatter, healthy recordings would be alarms. `scatters`: whether an
+    earlier baseline of the machine shows that they do.
     """
     none: tuple[CalibrationFactors, tuple[CusumHypothesis, ...], list[Message]] = CalibrationFactors(), (), []
     if not plant.holds or not plant.loudest or healthy.loop.monitor.model_error:
@@ -181,7 +182,7 @@ def learn_sequential_test(
     if healthy.covariates is not None:
         return *none[:2], [message("learning.no_test_along", names=healthy.covariates.names)]
     by_chance = homogeneity.scatter_probability(plant.deviations, plant.fit.each_covariance)
-    scatters = by_chance <= homogeneity.SCATTER_BY_CHANCE
+    scatters = scatters or by_chance <= homogeneity.SCATTER_BY_CHANCE
     if scatters or (healthy.population is not None and not healthy.population.sequential):
         return none
     assert plant.healthy is not None, "the physics hold"

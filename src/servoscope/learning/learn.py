@@ -16,7 +16,7 @@ from servoscope.baseline.records import BaselineSource, ExactPredictorFit, Healt
 from servoscope.baseline.sensors import learn_sensors
 from servoscope.core.arrays import to_tuples
 from servoscope.core.blas import with_one_blas_thread
-from servoscope.core.errors import LoopError, NotEnoughError
+from servoscope.core.errors import BaselineError, LoopError, NotEnoughError
 from servoscope.core.messages import Message, message
 from servoscope.detection.signal_defects import find_switched_off
 from servoscope.estimation import estimators
@@ -24,7 +24,7 @@ from servoscope.isolation.ml.validity import fit_exact_predictor
 from servoscope.learning.axis_fit import fit_axis
 from servoscope.learning.delay import check_delay
 from servoscope.learning.detectability import learn_detectability
-from servoscope.learning.features import learn_features
+from servoscope.learning.features import MIN_RECORDINGS, learn_features
 from servoscope.learning.healthy_plant import PlantKnowledge, learn_plant, learn_sequential_test
 from servoscope.learning.population import Population
 from servoscope.learning.recursion import (
@@ -60,11 +60,13 @@ def learn_baseline(
     progress: Progress = lambda _: None,
     accept_delay: bool = False,
     population: Population | None = None,
+    earlier: Baseline | None = None,
 ) -> Baseline:
     """Learn what healthy looks like.
 
-    With several recordings their scatter counts; a population of like machines is a prior. NotEnoughError: too short or
-    too little excitation; RecordingError: u and y are out of step, unless that is accepted.
+    With several recordings their scatter counts; a population of like machines is a prior, and so is the scatter of an
+    earlier baseline of this machine. NotEnoughError: too short or too little excitation; RecordingError: u and y are
+    out of step, unless that is accepted.
     """
     if not recordings:
         raise NotEnoughError("no recording to learn from: give at least one healthy recording")
@@ -87,7 +89,7 @@ def learn_baseline(
     healthy = replace(healthy, notes=[*healthy.notes, *simplified, *notes, *doubts, *off])
     progress("healthy parameters")
     try:
-        return _assemble_baseline(healthy, learn_plant(healthy), delay_s, progress)
+        return _assemble_baseline(healthy, learn_plant(healthy), delay_s, progress, earlier)
     except np.linalg.LinAlgError as error:
         names = ", ".join(rec.name for rec in recordings[:3])
         raise NotEnoughError(
@@ -113,13 +115,16 @@ def nominal_baseline(loop: Loop, progress: Progress = lambda _: None, duration_s
     return _assemble_baseline(healthy, learn_plant(healthy, exact=True), loop.delay, progress)
 
 
-def _learn_axis(healthy: HealthyRecordings) -> tuple[AxisModel | None, list[Message]]:
+def _learn_axis(healthy: HealthyRecordings, earlier: Baseline | None) -> tuple[AxisModel | None, list[Message]]:
     if not isinstance(healthy.loop.plant, AxisPlant):
         return None, []
     model = healthy.covariates
     logged = model is not None and model.warm_up is None
     moves = AxisMoves(covariates=model, names=healthy.pipeline.bank.names) if logged and model is not None else None
-    return fit_axis(healthy.loop, healthy.recordings, moves)
+    axis, notes = fit_axis(healthy.loop, healthy.recordings, moves)
+    if axis is not None and earlier is not None and earlier.axis is not None:
+        axis = axis.with_scatter(earlier.axis)
+    return axis, notes
 
 
 def _learn_features(healthy: HealthyRecordings) -> tuple[FeatureModel | None, list[Message]]:
@@ -129,20 +134,39 @@ def _learn_features(healthy: HealthyRecordings) -> tuple[FeatureModel | None, li
 
 
 def _assemble_baseline(
-    healthy: HealthyRecordings, plant: PlantKnowledge, delay_s: float | None, progress: Progress
+    healthy: HealthyRecordings,
+    plant: PlantKnowledge,
+    delay_s: float | None,
+    progress: Progress,
+    earlier: Baseline | None = None,
 ) -> Baseline:
     loop, recordings, pipeline = healthy.loop, healthy.recordings, healthy.pipeline
     progress("rehearsal")
-    calibration, hypotheses, test_notes = learn_sequential_test(healthy, plant)
-    axis, axis_notes = _learn_axis(healthy)
-    scatter = learn_scatter(healthy, plant, None if axis is None else axis.scatter(pipeline.bank.names))
+    if earlier is not None and earlier.names != pipeline.bank.names:
+        names = ", ".join(earlier.names), ", ".join(pipeline.bank.names)
+        raise BaselineError(f"the earlier or like baseline has coefficients {names[0]}, this loop {names[1]}")
+    before = earlier if earlier is not None and len(recordings) < earlier.scatter_from else None
+    scatters = before is not None and not before.thresholds.hypotheses
+    calibration, hypotheses, test_notes = learn_sequential_test(healthy, plant, scatters)
+    axis, axis_notes = _learn_axis(healthy, before)
+    axis_scatter = None if axis is None else axis.scatter(pipeline.bank.names)
+    scatter = learn_scatter(healthy, plant, axis_scatter, before)
     progress("features")
     features, feature_notes = _learn_features(healthy)
+    if features is not None and before is not None:
+        features = features.with_scatter(before.features)
     thresholds = learn_thresholds(healthy, calibration, hypotheses, features is not None)
     progress("promises")
     paths = follow_recordings(healthy, plant, scatter.theta)
-    covariance, left_out = widen_scatter(healthy, plant, scatter, paths, thresholds.statistic)
-    detectability, limits = learn_detectability(healthy, plant, paths, scatter, covariance, thresholds)
+    covariance, left_out, transient = widen_scatter(healthy, plant, scatter, paths, thresholds.statistic)
+    transient = transient if earlier is not None else 0.0 * transient
+    detectability, limits = learn_detectability(healthy, plant, paths, scatter, covariance, transient, thresholds)
+    if before is not None:
+        lacks = (
+            message("learning.carried_features", needed=MIN_RECORDINGS) if before.features and not features else None
+        )
+        known = {"known": before.scatter_from, "own": len(recordings)}
+        limits.append(message("learning.carried", **known, lacks=lacks))
     notes = [*healthy.notes, *plant.notes, *test_notes, *axis_notes, *scatter.notes, *feature_notes, *limits]
     between = to_tuples(scatter.own) if len(recordings) > 1 else ()
     baseline = Baseline(
@@ -154,7 +178,13 @@ def _assemble_baseline(
         covariance=to_tuples(covariance),
         recursion=describe_recursion(pipeline, plant.fit.tuning),
         healthy=plant.describe(),
-        scatter=HealthyScatter(between=between, left_out=tuple(left_out)),
+        scatter=HealthyScatter(
+            between=between,
+            left_out=tuple(left_out),
+            carried=tuple(scatter.carried),
+            carried_from=0 if before is None else before.scatter_from,
+            transient=tuple(transient) if transient.any() else (),
+        ),
         thresholds=thresholds,
         detectability=detectability,
         delay_s=delay_s,

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from servoscope.baseline.baseline import SETTLED_MEMORIES, Baseline
 from servoscope.baseline.covariates import CovariatePath
 from servoscope.baseline.hypothesis import CusumHypothesis
 from servoscope.baseline.records import AlarmThresholds
@@ -18,6 +19,8 @@ from servoscope.estimation.pipeline import Estimates
 from servoscope.learning.healthy_plant import PlantKnowledge
 from servoscope.learning.recursion import HealthyRecordings
 
+MIN_CERTAIN_STDS = 3.0  # standard deviations from zero from which the scatter of a coefficient is relative
+MIN_NOISE_SHARE = 1e-3  # of a variance, that is not scatter
 MIN_EIGENVALUE = 1e-9  # of a covariance in units of its diagonal
 
 
@@ -30,6 +33,7 @@ class Scatter:
     own: FloatArray  # covariance between the recordings less that of their noise, shape (n, n)
     between: FloatArray  # variance of a further recording beyond its noise, shape (n, n)
     error: FloatArray  # what the model of the plant may be off by, shape (n, n)
+    carried: FloatArray  # variances of a further recording that an earlier baseline knew, (n,), or none
     notes: tuple[Message, ...]
 
 
@@ -41,8 +45,14 @@ class HealthyPaths:
     deviations: Sequence[FloatArray]  # from what is expected of a healthy loop, shapes (K, n)
 
 
-def learn_scatter(healthy: HealthyRecordings, plant: PlantKnowledge, axis_scatter: FloatArray | None) -> Scatter:
-    """Compare the recordings; scatter of an axis counts too, for a change within a recording is told from its past."""
+def learn_scatter(
+    healthy: HealthyRecordings, plant: PlantKnowledge, axis_scatter: FloatArray | None, earlier: Baseline | None
+) -> Scatter:
+    """Compare the recordings; scatter of an axis counts too, for a change within a recording is told from its past.
+
+    A stretch after a repair shows little of how days differ: the relative scatter of an `earlier` baseline of more
+    recordings counts, and twice, for the stretch is one draw, and a further recording is another.
+    """
     fit, population, m = healthy.fit, healthy.population, len(healthy.recordings)
     error = np.diag((healthy.loop.monitor.model_error * fit.rms_eta / fit.tuning.scale) ** 2)
     if axis_scatter is not None:
@@ -56,10 +66,49 @@ def learn_scatter(healthy: HealthyRecordings, plant: PlantKnowledge, axis_scatte
         if not plant.ratios:
             theta, covariance = population.theta.combine(theta, covariance + pooled / m)
             between = pooled  # what the mean of m recordings is off by is in the covariance of theta now
+    carried = np.zeros(0) if earlier is None else carry_scatter(earlier, theta)
+    if carried.size:
+        between = between + np.diag(np.maximum(2.0 * carried - np.diag(between), 0.0))
     outliers = homogeneity.find_outliers(apart, noise + error)
     names = [rec.name for rec in healthy.recordings]
     notes = homogeneity.describe_outliers(outliers, names, healthy.pipeline.bank.names)
-    return Scatter(theta, covariance, own, between, error, tuple(notes))
+    return Scatter(theta, covariance, own, between, error, carried, tuple(notes))
+
+
+def carry_scatter(earlier: Baseline, theta: FloatArray) -> FloatArray:
+    """Return the variances (n,) of a further recording that a baseline knows, at coefficients (n,).
+
+    They are relative, but for coefficients that are hardly known.
+    """
+    known, m = earlier.scatter, len(earlier.sources)
+    variances = np.zeros(len(theta))
+    if known.between and (m >= homogeneity.MIN_RECORDINGS or not earlier.thresholds.hypotheses):
+        variances = np.maximum(np.diag(np.array(known.between)), 0.0) * homogeneity.prediction_factor(m)
+    if known.carried:
+        variances = np.maximum(variances, known.carried)
+    before = np.array(earlier.theta)
+    certain = before**2 > MIN_CERTAIN_STDS**2 * np.diag(earlier.covariance_array())
+    ratios = np.divide(theta, before, out=np.ones_like(theta), where=certain)
+    return np.asarray(variances * ratios**2)
+
+
+def forecast_covariance(baseline: Baseline, more: int) -> FloatArray:
+    """Return the covariance (n, n) to expect of a baseline that learns `more` recordings like those before.
+
+    What is not scatter is noise of the mean, which falls with their number; the scatter is predicted the better, the
+    more recordings show it.
+    """
+    known, m, C = baseline.scatter, len(baseline.sources), baseline.covariance_after(np.array(np.inf))
+    own = np.maximum(np.diag(np.array(known.between)), 0.0) if known.between else np.zeros(len(C))
+    carried = 2.0 * np.array(known.carried or np.zeros(len(C)))
+
+    def ahead(count: int) -> FloatArray:
+        counts = count >= homogeneity.MIN_RECORDINGS or not baseline.thresholds.hypotheses
+        scatter = counts * own * homogeneity.prediction_factor(count)
+        return np.maximum(scatter, carried) if count < known.carried_from else scatter
+
+    noise = np.maximum(np.diag(C) - ahead(m), MIN_NOISE_SHARE * np.diag(C))
+    return C + np.diag(noise * m / (m + more) + ahead(m + more) - np.diag(C))
 
 
 def learn_thresholds(
@@ -95,21 +144,26 @@ def follow_recordings(healthy: HealthyRecordings, plant: PlantKnowledge, theta: 
 
 def widen_scatter(
     healthy: HealthyRecordings, plant: PlantKnowledge, scatter: Scatter, paths: HealthyPaths, limit: float
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the covariance of a further recording (n, n), and the T^2 of each over its limit without it, (m,).
 
-    Judged by the others, none of four or more recordings may be an alarm.
+    Judged by the others, none of four or more recordings may be an alarm. The third is the part (n,) of the
+    covariance's diagonal that covers transients.
     """
     population, noise = healthy.population, healthy.fit.each_covariance
     shares = [e.Psi for e in paths.estimates]
     between = homogeneity.cover_transients(scatter.between, shares)
     others = homogeneity.scatter_of_others(plant.deviations, noise, shares)
-    told = others if population is None else [between] * len(shares)
+    told = others if population is None and not scatter.carried.size else [between] * len(shares)
     known = scatter.theta_covariance + scatter.error
     updated = [e.updates > 0 for e in paths.estimates]
     followed = [(d[at], e.S[at]) for d, e, at in zip(paths.deviations, paths.estimates, updated, strict=True)]
     factor, left_out = homogeneity.leave_one_out(followed, plant.deviations, told, known, limit)
-    return known + factor * between, left_out
+    settled = SETTLED_MEMORIES * healthy.pipeline.memory
+    late = [e.Psi[e.updates > settled] for e in paths.estimates]
+    transient = np.diag(between - homogeneity.cover_transients(scatter.between, late))
+    lasts = all(2 * len(part) >= len(Psi) for part, Psi in zip(late, shares, strict=True))
+    return known + factor * between, left_out, factor * np.maximum(transient, 0.0) * lasts
 
 
 def nearest_covariance(C: FloatArray) -> FloatArray:

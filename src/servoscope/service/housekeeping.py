@@ -13,6 +13,7 @@ from servoscope.service.actions.dispatcher import OutboxDispatcher
 from servoscope.service.alarms import LifecycleEvent, OperatorCommand
 from servoscope.service.assets.asset import Asset
 from servoscope.service.assets.records import StepResult, audit_row
+from servoscope.service.assets.status import Announcement
 from servoscope.service.clock import SteadyClock
 from servoscope.service.config import ServiceFile, StoreSettings
 from servoscope.service.log import log
@@ -20,8 +21,8 @@ from servoscope.service.metrics import MetricsContext, ServiceMetrics
 from servoscope.service.notifications import Notifier
 from servoscope.service.sources.message import RejectionCounter
 from servoscope.service.store import CommandOutcome, Row, Store
-from servoscope.service.store.rows import RELEARN
-from servoscope.service.store.series import thin_sizes
+from servoscope.service.store.rows import BASELINE_NOTE, CONFIRMATION, NOTE, RELEARN
+from servoscope.service.store.series import read_new_notes, thin_sizes
 
 DAY_S = 86400.0
 RETENTION_EVERY_S = 3600.0
@@ -56,6 +57,7 @@ class Housekeeping:
         self._service = service
         self._executed: set[int] = set()  # commands whose outcome is not yet stored
         self._rejections = RejectionCounter()
+        self._last_note, self._announced = 0, dict[str, Announcement | None]()
         self._next_retention = 0.0
         self._next_rejections: dict[tuple[str, str], float] = {}  # by asset and kind, monotonic [s]
         # by asset, until when on its clock its sizes are thinned, and until when they are to be
@@ -69,6 +71,7 @@ class Housekeeping:
         self._store_rejections()
         try:
             if self._service.writer.unavailable_since is None:
+                self._take_announcements()
                 self._execute_commands()
                 self._delete_old_rows()
                 self._thin_sizes()
@@ -112,6 +115,19 @@ class Housekeeping:
             log("warning", "refused", of=one.asset, kind=one.kind, count=one.count, why=one.reason)
             document = {"kind": one.kind, "count": one.count, "why": one.reason}
             self._service.writer.add(one.asset, [audit_row("refused", document)])
+
+    def _take_announcements(self) -> None:
+        """Let assets know what people have noted to be done to them, until their next baseline is in force."""
+        for row in read_new_notes(self._service.store, self._last_note):
+            self._last_note, name, note = row["id"], row["asset"], row["document"]
+            kind, known = note.get("kind", NOTE), self._announced.get(name)
+            if kind == CONFIRMATION:
+                self._announced[name] = known and known._replace(confirmed=True)
+            elif kind != NOTE:
+                self._announced[name] = None if kind == BASELINE_NOTE else Announcement(kind, note["t"])
+        for name, announced in self._announced.items():
+            if name in self._service.assets:  # a file that was read again has made some anew
+                self._service.assets[name].announce(announced)
 
     def _execute_commands(self) -> None:
         pending = self._service.store.pending_commands()

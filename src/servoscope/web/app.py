@@ -25,10 +25,10 @@ from servoscope.web import errors
 from servoscope.web.dependencies import Context
 from servoscope.web.metrics import WebMetrics
 from servoscope.web.middleware import API, SecurityMiddleware
-from servoscope.web.routes import alarms, assets, baselines, designs, diagnoses, events, relearning, session, uploads
+from servoscope.web.routes import alarms, assets, baselines, designs, diagnoses, events, renewal, session, uploads
 
 CLEANUP_S = 3600.0  # between two removals of expired uploads
-ROUTE_MODULES = (session, assets, alarms, events, diagnoses, uploads, baselines, designs, relearning)
+ROUTE_MODULES = (session, assets, alarms, events, diagnoses, uploads, baselines, designs, renewal)
 
 
 def create_app(context: Context) -> ASGIApp:

@@ -18,6 +18,13 @@ from servoscope.signals import quality
 
 def status_headline(status: AssetStatus) -> str:
     """Return the verdict on an asset in one sentence, in the reader's language and clock."""
+    headline = _verdict_headline(status)
+    if status.learning is None or headline == status.summary:
+        return headline
+    return status.learning.sentence(headline)
+
+
+def _verdict_headline(status: AssetStatus) -> str:
     faults, _ = status.newest_sizes
     if status.verdict == "fault" and faults and not faults[0].learned:
         since = message("diagnosis.since_date", t=status.onset or status.since, growth=None)

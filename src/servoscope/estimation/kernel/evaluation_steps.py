@@ -30,7 +30,7 @@ class EvaluationSteps:
         """
         n, at = self.size.n, self.at
         d = [s[self.to.theta + i] for i in range(n)]
-        Cov = self._covariance(c, s)
+        Cov = self._covariance(c, s, h)
         G: list[list[Any]] = [[] for _ in range(n)]
         white: list[Any] = []
         for j in range(n):
@@ -52,14 +52,14 @@ class EvaluationSteps:
             q[4 + i] = c[at.origin + i] + dot(row, d)
         self._write_congruence(basis, Cov, q, 4 + n)
 
-    def write_response(self, c: Any, s: Any, f: Any, q: Any) -> None:
+    def write_response(self, c: Any, s: Any, h: Any, f: Any, q: Any) -> None:
         """Write Re H, Im H at frequency f and their covariance (2, 2) behind the rest of the evaluation."""
         n = self.size.n
         begin, end = f * (2 * (n + 1)) + self.at.response, f * 6 + (4 + n + n * n)
         E = [[c[begin + (n * part + j)] for j in range(n)] for part in range(2)]
         for part in range(2):
             q[end + part] = c[begin + (2 * n + part)] + dot(E[part], [s[self.to.theta + j] for j in range(n)])
-        self._write_congruence(E, self._covariance(c, s), q, end + 2)
+        self._write_congruence(E, self._covariance(c, s, h), q, end + 2)
 
     def write_internal(self, s: Any, h: Any, q: Any) -> None:
         """Write the numbers that a diagnosis takes, in the recursion's own coordinates."""
@@ -71,10 +71,13 @@ class EvaluationSteps:
         for i, number in enumerate(numbers):
             q[i] = number
 
-    def _covariance(self, c: Any, s: Any) -> list[list[Any]]:
+    def _covariance(self, c: Any, s: Any, h: Any) -> list[list[Any]]:
         n, covariance = self.size.n, [[None] * self.size.n for _ in range(self.size.n)]
         for i, j in _lower_triangle(n):
-            covariance[i][j] = covariance[j][i] = s[self.to.S + tril_index(i, j)] + c[self.at.prior + n * i + j]
+            known = c[self.at.prior + n * i + j]
+            if self.size.fades:
+                known = where(h[UPDATES] > c[self.at.settled], c[self.at.settled_prior + n * i + j], known)
+            covariance[i][j] = covariance[j][i] = s[self.to.S + tril_index(i, j)] + known
         return covariance
 
     def _write_congruence(self, E: Sequence[Sequence[Any]], Cov: Sequence[Sequence[Any]], q: Any, at: Any) -> None:

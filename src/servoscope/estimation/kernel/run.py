@@ -153,7 +153,7 @@ class LaneBlock:
             return
         apply(self.evaluation.write_evaluation, c, self.s, self.h, q)
         for f in self.p.loop(0, self.size.frequencies):
-            apply(self.evaluation.write_response, c, self.s, f, q)
+            apply(self.evaluation.write_response, c, self.s, self.h, f, q)
 
     # states and samples between the arrays of a fleet and the lanes
 

@@ -30,6 +30,7 @@ class KernelSizes(NamedTuple):
     row: int
     floats: int
     directions: int  # of changes, whose sums move the CUSUMs once per evaluation
+    fades: bool  # whether a part of the baseline's covariance counts until the estimate has settled only
 
 
 class KernelSpec(NamedTuple):

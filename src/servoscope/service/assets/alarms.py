@@ -24,7 +24,7 @@ from servoscope.service.assets.checkpoint import AssetState, evolve
 from servoscope.service.assets.examination_schedule import ExaminationState
 from servoscope.service.assets.outlook import OutlookWord, outlook_word
 from servoscope.service.assets.reception import Reception
-from servoscope.service.assets.status import asset_snapshot
+from servoscope.service.assets.status import Announcement, asset_snapshot
 from servoscope.signals import quality
 
 
@@ -33,6 +33,7 @@ class _AlarmInputs(NamedTuple):
     findings: tuple[str, ...]
     reception: Reception
     outlook: OutlookWord
+    announced: Announcement | None
 
 
 class AssetAlarms:
@@ -43,6 +44,7 @@ class AssetAlarms:
         self.definitions = {key: one for key, one in alarms if limited or one.source != "outlook"}
         self.assesses = any(one.source == "control" for one in self.definitions.values())
         self._ahead_s = ahead_s
+        self.announced: Announcement | None = None
         self._settled: AlarmStandstill | None = None
         self._by_numbers = any(one.source in ("statistic", "level") for one in self.definitions.values())
 
@@ -59,7 +61,7 @@ class AssetAlarms:
         since, until = self._standstill(state, known)
         if since <= t < until:
             return evolve(state, alarms_at=t), ()
-        snapshot = asset_snapshot(state, known.findings, reception, known.outlook)
+        snapshot = asset_snapshot(state, known.findings, reception, known.outlook, known.announced)
         alarms, transitions = advance_alarms(self.definitions, state.alarms_now, snapshot, t)
         # after transitions a second step may do more, because alarms suppress each other
         still = not transitions and not self._by_numbers
@@ -102,4 +104,5 @@ class AssetAlarms:
 
     def _known(self, state: AssetState, reception: Reception, t: float) -> _AlarmInputs:
         word = outlook_word(state.outlook, state.examination.faults, t, self._ahead_s)
-        return _AlarmInputs(state.examination, tuple(quality.active_findings(state.quality)), reception, word)
+        findings = tuple(quality.active_findings(state.quality))
+        return _AlarmInputs(state.examination, findings, reception, word, self.announced)

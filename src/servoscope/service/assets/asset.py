@@ -46,7 +46,7 @@ from servoscope.service.assets.records import (
     transition_row,
 )
 from servoscope.service.assets.states import AssetStates, RestPeriod, StateHolder
-from servoscope.service.assets.status import AssetStatus, asset_metadata, asset_status
+from servoscope.service.assets.status import Announcement, AssetStatus, asset_metadata, asset_status
 from servoscope.service.config import DiagnosisSettings
 from servoscope.service.sources.block import Block
 from servoscope.service.store.bundles import pack_samples
@@ -111,6 +111,12 @@ class Asset(StateHolder):
             self.take_state()  # what its next block leads to is no longer what it was
         self._reception = reception
 
+    def announce(self, announced: Announcement | None) -> None:
+        """Let it learn again after what was done to it; None: it has learned."""
+        if announced != self._alarms.announced and self._state is not None:
+            self.take_state()
+        self._alarms.announced = announced
+
     def compile_kernels(self) -> None:
         """Compile what blocks need, so that the first one does not wait for it."""
         nothing, monitor = np.full(2, np.nan), self.monitor
@@ -163,7 +169,8 @@ class Asset(StateHolder):
 
     def status(self, state: AssetState) -> AssetStatus:
         """Return what users see of a state."""
-        return asset_status(state, self._alarms.definitions, self._metadata, self.reception)
+        about = self._alarms.definitions, self._metadata, self.reception, self._alarms.announced
+        return asset_status(state, *about, self.policy.diagnosis.kept_s)
 
     def standing_alarms(self, state: AssetState) -> list[tuple[str, str, str]]:
         """Return name, priority and state of each alarm that is not normal."""
@@ -281,16 +288,12 @@ class Asset(StateHolder):
         ]
 
     def _carry_covariates(self, blocks: Sequence[Block]) -> Sequence[Block]:
-        state = self.take_state()
-        history = self.monitor.covariate_history(state.monitor)
-        return carry_covariates(self.baseline, blocks, history, state.position.t)
+        history = self.monitor.covariate_history(self.take_state().monitor)
+        return carry_covariates(self.baseline, blocks, history, self.take_state().position.t)
 
     def is_news(self, window: PendingDiagnosis, diagnosis: StoredDiagnosis) -> bool:
         """Return whether a full diagnosis is the first of its fault, or names others than the last one."""
-        names, known = (
-            fault_names(diagnosis.document.get("faults", [])),
-            fault_names(self.take_state().examination.faults),
-        )
+        names, known = map(fault_names, (diagnosis.document.get("faults", []), self.take_state().examination.faults))
         return self._is_first_diagnosis(window) or bool(names and names != known)
 
     def _is_first_diagnosis(self, window: PendingDiagnosis) -> bool:
@@ -326,9 +329,6 @@ class Asset(StateHolder):
     def _add_row(self, table: str, **values: Any) -> None:
         self._result.rows.append(TableRow(table, {"number": self._next_row_number(), **values}))
 
-    def _add_sizes(self, rows: Iterable[dict[str, Any]]) -> None:
-        self._result.rows.extend(TableRow("sizes", row) for row in rows)
-
     def _count(self, accepted: NextBlock, followed: Followed) -> None:
         """Keep a block and the state after it."""
         (block, continuity, packed), state, (after, history) = accepted, self.take_state(), followed
@@ -339,24 +339,23 @@ class Asset(StateHolder):
         self._result = StepResult([TableRow("recent", stored)], [])
         if continuity.is_broken:
             self._result.rows.append(continuity.audit_row(position, block))
-        self.state = evolve(
-            after,
-            position=evolve(
-                position,
-                t=position.t if after.last_t is None else after.last_t,
-                sequence=block.sequence,
-                stream=block.stream,
-                blocks=position.blocks + 1,
-                samples=position.samples + block.t.size,
-                lost=position.lost + continuity.lost,
-                digest=zlib.crc32(block.pack(), position.digest),
-            ),
+        counted = evolve(
+            position,
+            t=position.t if after.last_t is None else after.last_t,
+            sequence=block.sequence,
+            stream=block.stream,
+            blocks=position.blocks + 1,
+            samples=position.samples + block.t.size,
+            lost=position.lost + continuity.lost,
+            digest=zlib.crc32(block.pack(), position.digest),
         )
+        self.state = evolve(after, position=counted)
         for row in history:
             self._add_row("residuals", **row)
         evaluation = self.take_state().evaluation
         if evaluation.t is not None and period_number(evaluation.t) != period_number(state.evaluation.t):
-            self._add_sizes(coefficient_rows(evaluation.t, evaluation.status.parameters))
+            rows = coefficient_rows(evaluation.t, evaluation.status.parameters)
+            self._result.rows.extend(TableRow("sizes", row) for row in rows)
 
     def _examine(self) -> None:
         """Examine the last minutes if that is due, and request a full diagnosis of a new fault."""
@@ -380,7 +379,8 @@ class Asset(StateHolder):
         if result is None:
             return
         if result.size is not None:
-            self._add_sizes(fault_rows(t, "live", [result.size.model_dump(mode="json")]))
+            rows = fault_rows(t, "live", [result.size.model_dump(mode="json")])
+            self._result.rows.extend(TableRow("sizes", row) for row in rows)
         if result.verdict != state.examination.verdict:
             self._add_row("diagnoses", t=t, grounds="examination", **result.columns())
         examination, in_full = schedule_full_diagnosis(examination, self._schedule, t)

@@ -6,11 +6,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.records import Occasion
 from servoscope.core.messages import message, render
 from servoscope.isolation.candidate import FaultEstimate
 from servoscope.service.alarms import (
@@ -29,6 +30,8 @@ from servoscope.service.assets.reception import RECEPTION_OK, Reception, Recepti
 from servoscope.service.assets.residual_history import EvaluationStatus
 from servoscope.signals import quality
 
+MIN_LEARN_S = 600.0  # length of a stretch that is enough to learn from [s], unless fewer samples are kept
+
 
 class _StatusRecord(BaseModel):
     model_config = ConfigDict(frozen=True, populate_by_name=True)
@@ -42,6 +45,30 @@ class AlarmStatus(_StatusRecord):
     priority: Priority | None = None
     cause: str = ""
     until: float | None = None  # end of its shelving [UTC s]
+
+
+class Announcement(NamedTuple):
+    """What was done to an asset, after which its baseline is learned again."""
+
+    after: Occasion
+    since: float  # [UTC s]
+    confirmed: bool = False  # whether somebody has said that what has changed since is no fault
+
+
+class LearningStatus(_StatusRecord):
+    """How far an asset is in learning again after what was done to it; until then it is judged as before."""
+
+    after: Occasion
+    since: float  # [UTC s]
+    confirmed: bool = False
+    learned_s: float
+    needed_s: float
+
+    def sentence(self, found: str) -> str:
+        """Return how far it is, with what the earlier baseline finds."""
+        key = "service.examination.confirmed" if self.confirmed else "service.examination.learning"
+        minutes = {"learned": self.learned_s / 60.0, "needed": self.needed_s / 60.0}
+        return render(message(key, after=self.after, found=found, **minutes))
 
 
 class AssetMetadata(_StatusRecord):
@@ -81,6 +108,7 @@ class AssetStatus(EvaluationStatus):
     # size, sized: of the fault by the newest examination, and when that was [UTC s]; None: by the full diagnosis alone
     size: FaultEstimate | None = None
     sized: float | None = None
+    learning: LearningStatus | None = None  # after a repair
     outlook: Outlook | None = None  # when the fault reaches its limit; None: it has none, or nothing is known yet
     position: StreamPosition = Field(alias="counted")
     metadata: AssetMetadata = Field(AssetMetadata(), alias="about")
@@ -146,24 +174,31 @@ def asset_summary(examination: ExaminationState, findings: Iterable[str], recept
     return render(message("service.examination.data_quality", findings=quality.describe_findings(findings)))
 
 
-def asset_verdict(examination: ExaminationState, findings: Iterable[str], reception: Reception) -> str:
+def asset_verdict(
+    examination: ExaminationState, findings: Iterable[str], reception: Reception, announced: Announcement | None = None
+) -> str:
     """Return the verdict that holds, with what data quality and the reception leave of the last examination's."""
     verdict = quality.limit_verdict(examination.verdict, findings)
     if verdict == "healthy" and reception != RECEPTION_OK:
         verdict = "undetermined"  # nobody knows what it does now
     if verdict == "undetermined" and examination.fault_at is not None:
         verdict = "fault"  # it was seen on sound data, and nothing has shown since that it has gone
-    return verdict
+    return "undetermined" if announced is not None and announced.confirmed else verdict
 
 
 def asset_snapshot(
-    state: AssetState, findings: tuple[str, ...], reception: Reception, outlook: OutlookWord
+    state: AssetState,
+    findings: tuple[str, ...],
+    reception: Reception,
+    outlook: OutlookWord,
+    announced: Announcement | None = None,
 ) -> AssetSnapshot:
     """Return what the asset's alarms go by."""
     statistic, level = state.evaluation.peaks
     current = current_outlook(state.outlook, state.examination.faults)
+    verdict = quality.limit_verdict(state.examination.verdict, findings)
     return AssetSnapshot(
-        verdict=quality.limit_verdict(state.examination.verdict, findings),
+        verdict="undetermined" if announced is not None and announced.confirmed else verdict,
         quality=findings,
         statistic=statistic,
         level=level,
@@ -180,17 +215,25 @@ def asset_status(
     definitions: Mapping[str, AlarmDefinition],
     metadata: AssetMetadata,
     reception: Reception = RECEPTION_OK,
+    announced: Announcement | None = None,
+    kept_s: float = 0.0,
 ) -> AssetStatus:
-    """Return the status of an asset."""
+    """Return the status of an asset; `announced`: after which it learns again; `kept_s`: how long samples are kept."""
     examination, findings = state.examination, quality.active_findings(state.quality)
     now = quality.limit_verdict(examination.verdict, findings)
     ne107 = evaluate_ne107(now, findings, [(definitions[name], alarm) for name, alarm in state.alarms.items()])
     named, evaluation = examination.named, state.evaluation.status
-    verdict = asset_verdict(examination, findings, reception)
+    verdict = asset_verdict(examination, findings, reception, announced)
     summary = named if now == "fault" and named else asset_summary(examination, findings, reception)
     if verdict == "fault" and now != "fault":
         fault = named or render(message("service.examination.seen"))
         summary = render(message("service.examination.stands", fault=fault, t=examination.fault_at, since=summary))
+    learning = None
+    if announced is not None:
+        needed_s = min(MIN_LEARN_S, kept_s)
+        learned_s = min(max(state.position.t - announced.since, 0.0), needed_s)
+        learning = LearningStatus(**announced._asdict(), learned_s=learned_s, needed_s=needed_s)
+        summary = learning.sentence(summary)
     return AssetStatus.model_construct(  # its values are checked where it is read
         **{
             "verdict": verdict,
@@ -225,6 +268,7 @@ def asset_status(
                 else {}
             ),
             **({} if (outlook := current_outlook(state.outlook, examination.faults)) is None else {"outlook": outlook}),
+            **({} if learning is None else {"learning": learning}),
             **({} if reception == RECEPTION_OK else {"reception": reception.state}),
             **{key: getattr(evaluation, key) for key in evaluation.model_fields_set},
         }

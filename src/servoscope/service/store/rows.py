@@ -11,6 +11,8 @@ from servoscope.prognosis.series import NORMAL_95
 Row = Mapping[str, Any]  # of any table
 CHECKS = "checks"  # in the audit: what to check on an asset for a fault, in its owner's words
 NOTE = "note"  # in the audit: what somebody noted about an asset
+BASELINE_NOTE = "baseline"  # kind of the note that a baseline was put in force
+CONFIRMATION = "confirmed"  # kind of the note that what has changed after a repair is no fault
 RELEARN = "relearn"  # command: take the baseline that an asset has now
 SIZE_EVERY_S = 600.0  # between two stored values of a coefficient
 # how the outcome of a refused command begins in rows of version 0.1, which have no fields for it

@@ -98,6 +98,13 @@ def read_notes(store: Store, asset: str) -> list[Row]:
     return sorted(notes, key=lambda note: float(note["t"]))
 
 
+def read_new_notes(store: Store, after: int) -> list[Row]:
+    """Return the audit's rows of notes behind a row, in their order: `id`, `asset`, `document`."""
+    table = tables.audit
+    query = sa.select(table.c.id, table.c.asset, table.c.document)
+    return store.fetch(query.where(table.c.id > after, table.c.what == NOTE).order_by(table.c.id))
+
+
 def read_checks(store: Store, asset: str) -> dict[str, Row]:
     """Return what people have written to be checked on an asset, by fault: `texts`, with `who` and `at`."""
     table = tables.audit

@@ -31,7 +31,7 @@ from servoscope.learning import inspection
 from servoscope.learning.proposal import init
 from servoscope.models.loop import Columns, Loop
 from servoscope.report import plain_values
-from servoscope.service.relearning import read_stretch
+from servoscope.service.renewal import read_stretch
 from servoscope.signals import Recording, readers
 from servoscope.signals.readers.axes import find_axes, signal_names
 from servoscope.signals.readers.formats import open_file

@@ -1,7 +1,7 @@
 // What the asset is compared with: noted repairs, how far it has learned since, a preview of the next baseline, and one step back.
 import { get, job, mayChange, post } from "./api.js";
 import { ask, during, field, h, section, table, tell } from "./dom.js";
-import { DASH, change, moment, number, plain } from "./words.js";
+import { DASH, change, moment, multiple, number, plain } from "./words.js";
 
 const OCCASIONS = { repair: "a repair", tool: "another tool", product: "another product", season: "another season" };
 const EVERY_MS = 5000;
@@ -10,8 +10,11 @@ export function relearning(path, session, asset, signal) {
   const [said, answer, shown] = [h("p", { class: "summary", role: "status" }), h("p", { class: "working", role: "status" }), h("div", {})];
   const press = (words, act) => h("button", { type: "button", onclick: act }, words);
   const [healthy, repaired, back] = [press("This was healthy", () => stretch()), press("This was repaired", () => repair()), press("One step back", () => undo())];
-  const buttons = [mayChange(session.role, "operator") && repaired, mayChange(session.role, "engineer") && [healthy, back]];
-  const element = section("Baseline", null, said, h("div", { class: "actions screen" }, buttons), answer, shown);
+  const intended = press("The change is intended", () => confirm());
+  intended.hidden = true;
+  const [off, offered] = [h("p", { class: "note" }), h("ul", { class: "why", translate: "no" })];
+  const buttons = [mayChange(session.role, "operator") && [repaired, intended], mayChange(session.role, "engineer") && [healthy, back]];
+  const element = section("Baseline", null, said, off, offered, h("div", { class: "actions screen" }, buttons), answer, shown);
   element.hidden = true;
   let state = null;
 
@@ -24,6 +27,9 @@ export function relearning(path, session, asset, signal) {
     const enough = state.learned_s >= state.needed_s;
     const learning = state.after && (enough ? `Learned enough after ${state.after}: look at the new baseline.` : `Learning after ${state.after}: ${minutes(state.learned_s)} of ${minutes(state.needed_s)} min.`);
     tell(said, learning || `Baseline ${state.revision} is in force.`);
+    tell(off, state.after ? `Distance from the earlier baseline: ${multiple(Math.max(asset().statistic ?? 0, asset().level ?? 0))} × limit.` : "");
+    offered.replaceChildren(...state.offers.map((text) => h("li", {}, text)));
+    intended.hidden = asset().learning?.confirmed !== false || asset().verdict !== "fault";
     healthy.classList.toggle("first", Boolean(state.after) && enough);
   }
 
@@ -39,11 +45,22 @@ export function relearning(path, session, asset, signal) {
     });
   }
 
+  // What differs from before is no fault: until the next baseline is in force, it is no alarm.
+  function confirm() {
+    const text = h("input", { maxlength: "200", required: true });
+    ask("The change is intended", "No alarm", [field("What was done", text)], async () => {
+      await post(`${path}/notes`, { t: asset().t, text: text.value, kind: "confirmed" }, signal);
+      await load();
+    }, asset().summary);
+  }
+
   function stretch() {
     const since = h("select", {}, state.since && h("option", { value: state.since }, `since ${moment(state.since, { seconds: false })}`), [600, 3600].map((seconds) => h("option", { value: asset().t - seconds }, `the last ${seconds / 60} min`)), h("option", { value: "" }, "all that is kept"));
     const why = h("input", { maxlength: "200" });
-    ask("Learn from samples", "Preview", [field("Samples", since), field("Why", why)], async () => {
-      const body = { from: since.value ? Number(since.value) : null, after: state.after, why: why.value };
+    const [first, last] = [0, 1].map(() => h("input", { type: "datetime-local", step: "1" }));
+    const time = (input) => (input.value ? new Date(input.value).getTime() / 1000 : null);
+    ask("Learn from samples", "Preview", [field("Samples", since), field("Or from", first), field("To", last), field("Why", why)], async () => {
+      const body = { from: time(first) ?? (since.value ? Number(since.value) : null), to: time(last), after: state.after, why: why.value };
       during(healthy, answer, async (step) => show(await job(`${path}/relearnings`, body, { signal, step })));
     });
   }

@@ -18,7 +18,7 @@ from servoscope.report.document import to_json
 from servoscope.service.alarms import PRIORITIES, TRANSITION_TABLE, LifecycleEvent, LifecycleState, Ne107
 from servoscope.service.alarms.records import UNACKNOWLEDGED_STATES
 from servoscope.service.assets.outlook import Outlook
-from servoscope.service.assets.status import AlarmStatus, AssetStatus, FloodCounts, ServiceStatus
+from servoscope.service.assets.status import AlarmStatus, AssetStatus, FloodCounts, LearningStatus, ServiceStatus
 from servoscope.web.asset_document import asset_document, status_headline
 from servoscope.web.schemas.checks import FaultCheck
 from servoscope.web.schemas.requests import CommandName
@@ -140,6 +140,7 @@ class AssetRow(ApiResponse):
     sizes: list[FaultSize]
     sized: float | None
     outlook: OutlookRow | None
+    learning: LearningStatus | None
     heard: bool
     t: float
     at: float
@@ -160,6 +161,7 @@ class AssetRow(ApiResponse):
             "sizes": fault_sizes(status),
             "sized": status.newest_sizes[1] if status.verdict == "fault" else None,
             "outlook": status.outlook.model_dump() if status.outlook else None,
+            "learning": status.learning,
             "heard": status.reception == "followed" and "silent" not in status.quality,
             "t": status.position.t,
             "at": at,

@@ -94,7 +94,7 @@ class NoteRequest(ApiRequest):
     t: UtcSeconds
     text: Annotated[str, Field(min_length=1, max_length=200)]
     anew: bool = False
-    kind: Literal["note"] | Occasion = "note"
+    kind: Literal["note", "confirmed"] | Occasion = "note"
 
 
 class RelearningRequest(ApiRequest):

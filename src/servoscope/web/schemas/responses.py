@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from servoscope.baseline.records import Occasion
+from servoscope.core.messages import MessageField
 from servoscope.diagnosis.result import Verdict
 from servoscope.service.access import Role
 from servoscope.web.stored_diagnosis import stored_headline
@@ -308,6 +309,7 @@ class RelearningState(ApiResponse):
     needed_s: float
     revision: int
     can_go_back: bool
+    offers: list[MessageField]
 
 
 class LoopRow(ApiResponse):

@@ -11,7 +11,7 @@ from starlette.status import HTTP_202_ACCEPTED
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.history import history_folder
-from servoscope.service import relearning
+from servoscope.service import renewal
 from servoscope.service.assets.status import AssetStatus
 from servoscope.service.config import ServiceFile
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Engineer
@@ -33,8 +33,10 @@ def _find_config(context: Context, asset: str) -> tuple[ServiceFile, AssetStatus
 
 def _progress(context: Context, config: ServiceFile, asset: str, status: AssetStatus) -> responses.RelearningState:
     baseline = load_cached(config.baseline_file(asset))
-    progress = relearning.learning_progress(config, context.store, asset, status, baseline)
-    return responses.RelearningState(**progress._asdict())
+    progress = renewal.learning_progress(config, context.store, asset, status, baseline)
+    point = config.assets[asset].point
+    offers = renewal.offers(baseline.at(point) if point else baseline, status, config.diagnosis.kept_s)
+    return responses.RelearningState(**progress._asdict(), offers=offers)
 
 
 @router.get("/assets/{asset}/relearning")
@@ -55,14 +57,14 @@ async def start_preview(
     path, point = config.baseline_file(asset), config.assets[asset].point or ""
     before = await asyncio.to_thread(load_cached, path)
     stretch = await asyncio.to_thread(
-        relearning.stored_stretch, config, context.store, asset, before, request.since, request.until
+        renewal.stored_stretch, config, context.store, asset, before, request.since, request.until
     )
     id_, out = await asyncio.to_thread(context.storage.create, "learnings")
-    file = await asyncio.to_thread(relearning.write_stretch, out, stretch)
+    file = await asyncio.to_thread(renewal.write_stretch, out, stretch)
 
     def finish(result: responses.JsonObject) -> responses.JsonObject:
         learned = Baseline.load(out / "baseline.json")
-        judged = relearning.judge_again(context.store, asset, before, learned, find_asset(context, asset)[1].position.t)
+        judged = renewal.judge_again(context.store, asset, before, learned, find_asset(context, asset)[1].position.t)
         context.storage.publish(responses.LearningRow(id=id_, who=who.user, uploads=[asset, file.name]))
         return {"learning": id_, "judged": judged._asdict(), **result}
 
@@ -80,13 +82,13 @@ def put_in_force(context: ContextDep, who: Engineer, asset: str, request: TakeRe
     """Put the baseline of a preview in force, or go one step back; the earlier one is kept."""
     config, status = _find_config(context, asset)
     if request.learning is None:
-        relearning.go_back(config, context.store, asset, who.user, request.why, status.position.t)
+        renewal.go_back(config, context.store, asset, who.user, request.why, status.position.t)
         return _progress(context, config, asset, status)
     record = context.storage.read(responses.LearningRow, request.learning)
     if record.uploads[:1] != [asset]:
         raise HTTPException(404, f"there is no preview {request.learning} of {asset}")
     folder = context.storage.path(responses.LearningRow, request.learning)
     learned = Baseline.load(folder / "baseline.json")
-    stretch = relearning.read_stretch(folder / record.uploads[1], learned)
-    relearning.put_in_force(config, context.store, asset, learned, stretch, status.position.t)
+    stretch = renewal.read_stretch(folder / record.uploads[1], learned)
+    renewal.put_in_force(config, context.store, asset, learned, stretch, status.position.t)
     return _progress(context, config, asset, status)

@@ -13,7 +13,7 @@ from axis_logs import REPAIRED, repaired_axis
 from commands import one_line, run
 
 import servoscope as ss
-from servoscope.service import relearning
+from servoscope.service import renewal
 from servoscope.service.assets.status import AssetStatus
 from servoscope.service.build import build_components
 from servoscope.service.config import ServiceFile
@@ -60,9 +60,14 @@ def test_a_repair_is_learned_by_a_running_service_and_one_step_leads_back(hall: 
     store.add_audit("otto", "axis", "note", {"t": t, "text": "motor exchanged", "anew": True, "kind": "repair"})
     now = wait(lambda now: now.position.t > t + 100.0)
     learned = ss.Baseline.load(settings.baseline_file("axis"))
-    progress = relearning.learning_progress(settings, store, "axis", now, learned)
+    progress = renewal.learning_progress(settings, store, "axis", now, learned)
     assert (progress.after, progress.since, progress.revision) == ("repair", t, 1)
     assert 100.0 < progress.learned_s <= progress.needed_s == 200.0
+    assert now.learning is not None and now.learning.after == "repair" and now.verdict == "fault"
+    assert now.summary.startswith("Learning after repair, ") and " of 3.3 min. Against the earlier " in now.summary
+    store.add_audit("otto", "axis", "note", {"t": t, "text": "lighter motor", "anew": False, "kind": "confirmed"})
+    confirmed = wait(lambda now: now.learning is not None and now.learning.confirmed)
+    assert confirmed.verdict == "undetermined" and "Confirmed as no fault: Fault" in confirmed.summary
     preview = json.loads(run("relearn", hall, "axis", "--json").out)
     moves = {row["name"]: row["change"] for row in preview["points"][0]["moves"]}
     assert moves["inertia"] == pytest.approx(REPAIRED - 1.0, abs=0.1)
@@ -74,8 +79,8 @@ def test_a_repair_is_learned_by_a_running_service_and_one_step_leads_back(hall: 
     assert (note["who"], note["kind"], note["anew"]) == ("otto", "baseline", True) and "motor exchanged" in note["text"]
     renewed = ss.Baseline.load(settings.baseline_file("axis"))
     now = wait(lambda now: now.metadata.baseline == renewed.hash and now.verdict == "healthy")
-    assert not now.alarms and not store.pending_commands()
-    assert relearning.learning_progress(settings, store, "axis", now, renewed).can_go_back
+    assert now.learning is None and not now.alarms and not store.pending_commands()
+    assert renewal.learning_progress(settings, store, "axis", now, renewed).can_go_back
     # a further healthy stretch joins the one that was kept with the history
     added = json.loads(run("relearn", hall, "axis", "--why", "run in", "--json").out)
     assert added["revision"]["kind"] == "healthy" and added["revision"]["reference"] == 2

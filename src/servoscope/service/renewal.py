@@ -13,20 +13,22 @@ from servoscope.baseline.history import history_folder, replace_baseline, step_b
 from servoscope.baseline.records import RENEWALS, Occasion
 from servoscope.core.errors import BaselineError, RecordingError
 from servoscope.core.files import make_folder
+from servoscope.core.messages import Message, message
+from servoscope.learning.detectability import forecast_changes
 from servoscope.prognosis.series import NORMAL_95
 from servoscope.service.assets.examination import blocks_to_recording
-from servoscope.service.assets.status import AssetStatus
+from servoscope.service.assets.status import MIN_LEARN_S, AssetStatus
 from servoscope.service.config import ServiceFile
 from servoscope.service.sources.block import Block
 from servoscope.service.store import Store
-from servoscope.service.store.rows import NOTE, RELEARN
+from servoscope.service.store.rows import BASELINE_NOTE, CONFIRMATION, NOTE, RELEARN
 from servoscope.service.store.series import read_notes, read_series
 from servoscope.signals import Recording, readers
 from servoscope.signals.writers import plain_columns, write_recording
 
-MIN_LEARN_S = 600.0  # length of a stretch that is enough to learn from [s], unless fewer samples are kept
+OFFERED_RECORDINGS = 1, 10  # further ones whose gain is stated
+MAX_OFFERED_RATIO = 0.95  # of a smallest detectable change, that is worth an offer
 JUDGED_AGAIN_S = 28 * 86400.0  # of past values that a preview judges again [s]
-BASELINE_NOTE = "baseline"  # kind of the note that a baseline was put in force
 
 
 class LearningProgress(NamedTuple):
@@ -53,13 +55,31 @@ def learning_progress(
 ) -> LearningProgress:
     """Return how far the learning of an asset is; `baseline`: the one in force."""
     revision = baseline.revision
-    notes = [note for note in read_notes(store, asset) if note.get("kind", NOTE) != NOTE]
+    notes = [note for note in read_notes(store, asset) if note.get("kind", NOTE) not in (NOTE, CONFIRMATION)]
     kept_s = config.diagnosis.kept_s
     known = min(MIN_LEARN_S, kept_s), revision.number, revision.parent > 0
     if not notes or notes[-1]["kind"] == BASELINE_NOTE:
         return LearningProgress(None, None, 0.0, *known)
     last = notes[-1]
     return LearningProgress(last["kind"], last["t"], min(max(status.position.t - last["t"], 0.0), kept_s), *known)
+
+
+def offers(baseline: Baseline, status: AssetStatus, kept_s: float) -> list[Message]:
+    """Return what further healthy recordings would bring, and how long a healthy stretch is at hand.
+
+    `baseline`: the one in force, of the asset's operating point. Nothing is offered while something is wrong.
+    """
+    healthy_s = min(status.position.t - status.since, kept_s)
+    if status.verdict != "healthy" or status.learning is not None or healthy_s < min(MIN_LEARN_S, kept_s):
+        return []
+    found = [message("service.renewal.ready", minutes=healthy_s / 60.0)]
+    for more in OFFERED_RECORDINGS:
+        changes = forecast_changes(baseline, more)
+        name = min(changes, key=lambda each: changes[each][1] / changes[each][0], default="")
+        if name and changes[name][1] < MAX_OFFERED_RATIO * changes[name][0]:
+            before, after = (100.0 * size for size in changes[name])
+            found.append(message("service.renewal.offer", more=more, fault=name, before=before, after=after))
+    return found
 
 
 def stored_stretch(
