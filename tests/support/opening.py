@@ -14,9 +14,7 @@ import pytest
 import screens
 from PIL import Image
 from screens import asked, until
-from sources import load
 
-pictures = load(Path(__file__).resolve().parents[2] / "scripts" / "pictures.py")
 SIZE = {"width": 1366, "height": 768}
 THEMES = ("light", "dark")
 PATIENCE_MS = 30_000.0
@@ -101,7 +99,9 @@ def users(config: Path) -> str:
 
 def shot(page: Any, name: str, **how: Any) -> None:
     """Write a picture for the docs, where one is asked for; else compare what it shows with the one that is there."""
-    picture = f"pages/{name}.png"
+    from sources import load  # not above: this file is a plugin of all tests, also of those in a copy without scripts
+
+    pictures, picture = load(Path(__file__).resolve().parents[2] / "scripts" / "pictures.py"), f"pages/{name}.png"
     words = page.eval_on_selector_all("nav a, h1", "all => all.filter(e => e.checkVisibility()).map(e => e.innerText)")
     shows, folder = pictures.shown_by_page(words), os.environ.get("SCREENSHOTS")
     if not folder:
