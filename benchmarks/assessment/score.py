@@ -19,7 +19,7 @@ from records import Records, measured, servos, simulated
 from train import SEED, SIMULATED, fit
 
 from servoscope.assessment.assess import MIN_PROBABILITY
-from servoscope.assessment.causes import CAUSES, MIN_ALARM_PROBABILITY, POOR_CONTROL
+from servoscope.assessment.causes import CAUSES, MIN_SURE_PROBABILITY, POOR_CONTROL
 from servoscope.assessment.features import analyse
 from servoscope.assessment.posterior import load_posterior
 
@@ -140,14 +140,14 @@ def servo_table(training: Records, real: Records, servo: Records) -> Table:
         features = servo.features[servo.loops == folder]
         left_out, whole = fit(training, real, servo, folder).probabilities(features), load_posterior()
         sure = [
-            str((p[:, alarming].max(axis=1) >= MIN_ALARM_PROBABILITY).sum())
+            str((p[:, alarming].max(axis=1) >= MIN_SURE_PROBABILITY).sum())
             for p in (left_out, whole.probabilities(features))
         ]
         rows.append((folder, str(len(features)), str((left_out[:, 0] > 0.5).sum()), *sure))
     return Table(
         "Healthy servo recordings",
         "Judged by a posterior that was fitted without the recordings of their folder, and by the one that is shipped.",
-        ("folder", "recordings", "stiction above 0.5", "poor control above 0.9", "the same, shipped"),
+        ("folder", "recordings", "stiction above 0.5", "stiction or backlash above 0.9", "the same, shipped"),
         tuple(rows),
     )
 

@@ -80,6 +80,24 @@ def test_a_missing_reference_and_gaps_do_not_stop_it() -> None:
     assert result.signals.t.size == 900  # the gap of two rows is filled, the one of a hundred cuts
 
 
+def test_an_error_that_oscillates_with_its_reference_is_no_disturbance_from_outside() -> None:
+    """A servo axis with friction under PD control with feed-forward, which follows two sinusoids well."""
+    rng, dt, n = np.random.default_rng(0), 0.01, 4000
+    t = np.arange(n) * dt
+    r = np.sin(np.pi * t) + 0.5 * np.sin(8.5 * t + 1.0)
+    speed = np.gradient(r, dt)
+    y, u, x, v = np.zeros(n), np.zeros(n), 0.0, 0.0
+    for k in range(n):
+        y[k] = x + 1e-5 * rng.standard_normal()
+        u[k] = 8.0 * (r[k] - y[k]) + 0.6 * (speed[k] - v)
+        for _ in range(10):
+            v += 0.1 * dt * (u[k] - 0.1 * v - 0.05 * np.tanh(v / 0.01)) / 0.02
+            x += 0.1 * dt * v
+    result = ss.assess({"t": t, "r": r, "u": u, "y": y})
+    assert result.probabilities["oscillation from outside"] == result.probabilities["too tight"] == 0.0
+    assert result.probabilities["stiction"] < 0.5
+
+
 def test_rows_in_manual_mode_are_cut_out() -> None:
     log = loop(5)
     mode = np.where((np.arange(N) > 700) & (np.arange(N) < 900), 0.0, 1.0)

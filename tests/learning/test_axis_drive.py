@@ -95,3 +95,18 @@ def test_a_known_mass_tells_the_scale_of_u() -> None:
 def test_an_axis_at_its_limit_is_no_obstacle() -> None:
     limited = ss.Loop.from_dict({"sample_rate": RATE, "plant": AXIS, "input_limits": [-0.1, 0.1]})
     assert saturated_share(limited, swung(0)) == 0.0
+
+
+def test_an_axis_of_a_sample_in_ten_seconds_is_learned() -> None:
+    """What correlates within one sample has no upper bound in seconds: a slow log must not leave the search none."""
+    rate, n, rng = 0.1, 2000, np.random.default_rng(0)
+    t = np.arange(n) / rate
+    r = np.sin(2.0 * np.pi * t / 2000.0) + 0.5 * np.sin(2.0 * np.pi * t / 740.0 + 1.0)
+    speed = np.gradient(r, 1.0 / rate)
+    force = 2e3 * np.gradient(speed, 1.0 / rate) + 50.0 * speed + 0.05 * np.sign(speed)
+    logs = [
+        clean(t, r, force + 0.002 * rng.standard_normal(n), r + 1e-5 * rng.standard_normal(n), sample_rate=rate)
+        for _ in range(2)
+    ]
+    loop = ss.Loop.from_dict({"name": "slow", "sample_rate": rate, "plant": {"kind": "axis"}})
+    assert ss.learn(loop, logs).axis is not None

@@ -10,8 +10,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, PrivateAttr
 
 from servoscope.assessment import indices
-from servoscope.assessment.causes import CAUSES, MIN_ALARM_PROBABILITY, POOR_CONTROL, Cause
+from servoscope.assessment.causes import CAUSES, MIN_SURE_PROBABILITY, Cause
 from servoscope.assessment.features import Analysis, analyse
+from servoscope.assessment.indices import octave_around
+from servoscope.assessment.models import thin
 from servoscope.assessment.posterior import load_posterior
 from servoscope.assessment.tags import find_loops
 from servoscope.core.arrays import FloatArray
@@ -29,6 +31,7 @@ MAX_ROWS = 200_000  # that are analysed; of a longer log, means of neighbours ar
 MAX_MISSING_SHARE = 0.3
 MAX_FILLED_GAP = 3  # samples that are interpolated; at a longer gap the log is cut
 MIN_PROBABILITY = 0.5  # of a verdict
+MIN_REFERENCE_SHARE = 0.5  # of an oscillation, from which on the reference causes it
 MIN_SAMPLES_PER_PERIOD = 6.0
 MIN_REGULARITY = 1.0  # of an oscillation, after Thornhill et al.
 MAX_HARRIS_ROWS = 5000
@@ -104,9 +107,10 @@ class Assessment(ShortRepr, BaseModel):
         return self._signals
 
     @property
-    def alarming_cause(self) -> Cause | None:
-        """The cause, where it is one of poor control and nearly certain."""
-        return self.verdict if self.verdict in POOR_CONTROL and self.probability >= MIN_ALARM_PROBABILITY else None
+    def sure_cause(self) -> Cause | None:
+        """The cause, where it is nearly certain."""
+        sure = self.verdict != "cannot tell" and self.probability >= MIN_SURE_PROBABILITY
+        return self.verdict if sure else None  # type: ignore[return-value]  # all other verdicts are causes
 
     @property
     def oscillates(self) -> bool:
@@ -168,7 +172,24 @@ def assess(log: Samples | Source, *, name: str | None = None, travel: tuple[floa
         signals = AssessedSignals(t, r, u, y, None)
     analysis = analyse(r, u, y)
     signals = AssessedSignals(t, r, u, y, analysis)
-    return _conclude(facts, load_posterior().of(analysis.features), signals, travel)
+    probabilities = load_posterior().of(analysis.features)
+    if r is not None and _follows_reference(analysis, r):
+        probabilities |= dict.fromkeys(("oscillation from outside", "too tight"), 0.0)
+        total = sum(probabilities.values())
+        probabilities = {cause: p / total for cause, p in probabilities.items()}
+    return _conclude(facts, probabilities, signals, travel)
+
+
+def _follows_reference(analysis: Analysis, r: FloatArray) -> bool:
+    """Return whether the reference explains the error's oscillation, by r, r' and sign(r') in the same octave."""
+    if analysis.oscillation is None:
+        return False
+    speed = np.gradient(thin(r, analysis.thinned))
+    moves = np.stack([thin(r, analysis.thinned), speed, np.sign(speed)])
+    rows = np.stack([octave_around(x, analysis.oscillation.period) for x in moves], axis=1)
+    error = analysis.oscillation.band
+    left = error - rows @ np.linalg.lstsq(rows, error, rcond=None)[0]
+    return bool(left @ left < (1.0 - MIN_REFERENCE_SHARE) * (error @ error))
 
 
 def _means(x: FloatArray, factor: int) -> FloatArray:

@@ -17,6 +17,6 @@ Cause = Literal[
     "good",
 ]
 CAUSES: tuple[Cause, ...] = get_args(Cause)
-# what no healthy loop should show: `learn` warns of it, and an alarm of the source ``control`` is for it
-POOR_CONTROL: tuple[Cause, ...] = ("stiction", "backlash", "too tight", "oscillation from outside", "saturation")
-MIN_ALARM_PROBABILITY = 0.9  # of such a cause
+# what no healthy loop shows, whatever its reference does: `learn` warns of it, and alarms go by it unless they say more
+POOR_CONTROL: tuple[Cause, ...] = ("stiction", "backlash")
+MIN_SURE_PROBABILITY = 0.9  # of a cause that is warned of

@@ -64,6 +64,13 @@ def find_oscillation(x: FloatArray) -> Oscillation | None:
     return Oscillation(2.0 * float(intervals.mean()), regularity, share, band)
 
 
+def octave_around(x: FloatArray, period: float) -> FloatArray:
+    """Return a signal within an octave around a period [samples]."""
+    spectrum = np.fft.rfft(signal.detrend(x))
+    frequency = np.fft.rfftfreq(x.size) * period
+    return np.asarray(np.fft.irfft(np.where((frequency > 0.5) & (frequency < 2.0), spectrum, 0.0), x.size))
+
+
 def smooth_to(x: FloatArray, period: float, harmonics: float = 7.0) -> FloatArray:
     """Return a signal without what is slower than a third of the oscillation, or faster than its 7th harmonic."""
     spectrum = np.fft.rfft(signal.detrend(x))

@@ -104,7 +104,7 @@ def fit_axis_noise(problems: Sequence[AxisRegression], slow: float) -> AxisNoise
     start = np.log([0.2 * size, 1.0 / rate, max(float(rough.std()), 1e-12 * size)])
     bounds = [
         (start[0] - 7.0, start[0] + 5.0),
-        tuple(np.log([0.1 / rate, MAX_FORCE_CORRELATION_S])),
+        tuple(np.log([0.1 / rate, max(MAX_FORCE_CORRELATION_S, 1.0 / rate)])),
         (start[2] - 9.0, start[2] + 3.0),
     ]
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from servoscope.assessment.assess import assess
+from servoscope.assessment.causes import POOR_CONTROL
 from servoscope.baseline.axis_model import AxisModel, AxisMoves
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.feature_model import FeatureModel
@@ -48,7 +49,7 @@ Progress = Callable[[str], None]
 def doubt_healthy(recording: Recording) -> Message | None:
     """Return that a recording shows a cause of poor control by itself, with near certainty, if it does."""
     assessment = assess(recording)
-    if (cause := assessment.alarming_cause) is None:
+    if (cause := assessment.sure_cause) not in POOR_CONTROL:
         return None
     return message("learning.doubt", recording=recording.name, cause=cause, probability=assessment.probability)
 

@@ -144,7 +144,7 @@ def _assess_blocks(baseline: Baseline, name: str, blocks: Sequence[Block]) -> st
         assessment = assess(blocks_to_recording(baseline, name, blocks)[0])
     except ServoscopeError:
         return None
-    return assessment.alarming_cause or (None if assessment.verdict == "cannot tell" else "")
+    return assessment.sure_cause or (None if assessment.verdict == "cannot tell" else "")
 
 
 def compile_examination(baseline: Baseline) -> None:
