@@ -23,7 +23,7 @@ from servoscope.signals.readers import as_recording
 from servoscope.signals.readers.frames import Source
 from servoscope.signals.recording import thin_out
 
-MAX_SAMPLES = 400_000  # of all recordings, that are learned from: more take memory and time, and show little more
+MAX_SAMPLES = 250_000  # of all recordings, that are learned from: more take memory and time, and show little more
 MIN_MEMORIES = 10.0  # of the estimator, in a stretch of a long recording
 MIN_PROBABILITY_NOTED = 0.05  # probability from which a fault is noted that looks like another operating point
 

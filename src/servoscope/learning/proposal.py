@@ -25,7 +25,7 @@ from servoscope.models.loop import Columns, Loop, MonitorSettings
 from servoscope.signals import Recording
 from servoscope.signals.readers import ChannelInfo, list_channels, read
 from servoscope.signals.readers.axes import find_axes, signal_names
-from servoscope.signals.readers.columns import LinearCombination, parse_combination, parse_fields
+from servoscope.signals.readers.columns import LinearCombination, header_hint, parse_combination, parse_fields
 from servoscope.signals.readers.formats import open_file
 from servoscope.signals.readers.guess_columns import (
     FIELDS,
@@ -120,7 +120,9 @@ def propose_columns(
     fields = {**guess_mapping([name for name in names if name not in used]), **told}
     missing = [letter for letter in "uy" if fields[FIELDS[letter]] is None]
     if missing:
-        shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+        shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "") + header_hint(names)
+        if texts := [channel.name for channel in channels if channel.dtype == "string"]:
+            shown += f"; text in {', '.join(texts[:12])}: --comment leaves out lines that hold no row"
         raise RecordingError(
             f"{path}: no name suggests {' and '.join(missing)}: say which columns they are,"
             f" {mapping_template(fields)}; the file has {shown}"

@@ -22,6 +22,7 @@ BUILT_IN = tuple(  # written like the entry points of other packages, and loaded
     EntryPoint(name, f"servoscope.signals.readers.{value}", ENTRY_POINTS)
     for name, value in (
         ("join", "joined:open_joined"),
+        ("mqtt", "topic:open_topic"),
         ("sql", "sql:open_sql"),
         ("influx", "influx:open_influx"),
         ("delta", "lake_tables:open_delta"),

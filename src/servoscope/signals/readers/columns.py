@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -112,13 +112,17 @@ def find_channel(name: str, known: Iterable[str], where: str) -> str:
         where = where.removesuffix(f": [columns] {key}")
         hint = f"say where the signals stand: {mapping_template(guess_mapping(known))} or [columns] in the loop file"
         name_ = f"no column {name!r}; {hint}; the file has {', '.join(known[:MAX_SHOWN]) or 'none'}"
-        unnamed = HEADER_HINT if known == [f"c{index}" for index in range(len(known))] else ""
-        raise RecordingError(f"{where}: {name_}" + (", ..." if len(known) > MAX_SHOWN else "") + unnamed)
+        raise RecordingError(f"{where}: {name_}" + (", ..." if len(known) > MAX_SHOWN else "") + header_hint(known))
     shown = ", ".join(near or known[:MAX_SHOWN]) + (", ..." if not near and len(known) > MAX_SHOWN else "")
     hint = f"did you mean {shown}?" if near else f"the file has {shown or 'none'}"
     if other is not None:
         hint += f" Where files differ, write {name} | OTHER"
     raise RecordingError(f"{where}: no column {name!r}, {hint}")
+
+
+def header_hint(names: Sequence[str]) -> str:
+    """Return what to do where no line was found that names the columns, as the end of a message; else nothing."""
+    return HEADER_HINT if list(names) == [f"c{index}" for index in range(len(names))] else ""
 
 
 def parse_combination(text: str, known: Iterable[str], where: str) -> LinearCombination:

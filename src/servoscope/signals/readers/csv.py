@@ -163,6 +163,10 @@ def read_csv(path: Path, layout: CsvLayout, wanted: Sequence[str], texts: Collec
                 " --header-row says which line names its columns"
             )
         yield table
+    if size > CHUNK_BYTES:
+        import pyarrow as pa
+
+        pa.system_memory_pool().release_unused()
 
 
 def _iter_text_chunks(path: Path, layout: CsvLayout) -> Iterator[tuple[bytes, int, bool]]:
@@ -243,6 +247,7 @@ def _parse_chunk(
                 include_columns=list(wanted),
                 column_types=dict.fromkeys(texts, pa.string()),
             ),
+            memory_pool=pa.system_memory_pool(),  # others keep a hundred megabytes once they are not used any more
         )
 
     try:

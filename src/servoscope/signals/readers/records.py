@@ -37,11 +37,18 @@ def open_json(path: Path) -> TableFile:
         if isinstance(found, dict):
             found = {name: values for name, values in found.items() if isinstance(values, list)}
             return _open_frame(path, pa.table(found))
-        return _open_frame(path, pa.Table.from_pylist(found))
+        return open_records(path, found)
     except (pa.ArrowException, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise RecordingError(
             f"{path}: is no table in JSON ({shorten_error(error)}), write one record per line"
         ) from None
+
+
+def open_records(path: Path, records: Sequence[Mapping[str, Any]]) -> TableFile:
+    """Open a list of records."""
+    import pyarrow as pa
+
+    return _open_frame(path, pa.Table.from_pylist(records))
 
 
 def open_feather(path: Path) -> TableFile:

@@ -1,0 +1,85 @@
+"""A log of 1 GB through `init`, `learn` and `diagnose`: wall time, CPU time, and the largest resident size of each.
+
+    python benchmarks/large_log.py [--json] [--rows N]
+
+The log is a CSV of t, r, u and y of the reference rig at 100 Hz, whose motion repeats every 10 s. The file is in the
+cache of the system.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+from tables import Table, parser, show
+
+from servoscope.models.loop import Loop
+from servoscope.simulation import reference, simulate
+
+LOOP = Path(__file__).resolve().parent.parent / "src" / "servoscope" / "simulation" / "reference-rig.toml"
+PERIODS = 420  # of 10 s, that are simulated; the log repeats them
+GOAL_MB = 600
+
+
+def write_log(path: Path, rows: int) -> None:
+    """Write a log of so many rows; the start of the simulation, from rest, is left out."""
+    loop = Loop.load(LOOP)
+    motion = np.tile(reference("multisine", 10.0, loop.sample_rate), PERIODS + 6)
+    cycle = simulate(loop, motion, seed=1)[0].rows(slice(motion.size - PERIODS * 1000, None))
+    columns = {name: getattr(cycle, name).round(7) for name in "ruy"}
+    with path.open("wb") as file:
+        file.write(b"t,r,u,y\n")
+        for begin in range(0, rows, cycle.samples):
+            t = (np.arange(begin, begin + cycle.samples) / loop.sample_rate).round(4)
+            table = pa.table({"t": t, **columns}).slice(0, rows - begin)
+            pyarrow.csv.write_csv(table, file, pyarrow.csv.WriteOptions(include_header=False))
+
+
+def run(*command: str, folder: Path) -> tuple[str, float, float, int]:
+    """Return what a command of servoscope prints, its wall time [s], its CPU time [s], and its largest size [MB]."""
+    start = time.perf_counter()
+    with (folder / "printed").open("w+") as printed:
+        process = subprocess.Popen([sys.executable, "-m", "servoscope", *command], cwd=folder, stdout=printed)
+        _, status, usage = os.wait4(process.pid, 0)
+        printed.seek(0)
+        text = printed.read()
+    if status:
+        sys.exit(f"{' '.join(command)}: status {status}\n{text}")
+    return text, time.perf_counter() - start, usage.ru_utime + usage.ru_stime, round(usage.ru_maxrss * 1024 / 1e6)
+
+
+def main() -> None:
+    """Write the log, run the three commands, print what they took."""
+    command = parser(__doc__)
+    command.add_argument("--rows", type=int, default=27_000_000)
+    given = command.parse_args()
+    with tempfile.TemporaryDirectory(prefix="large-log-") as name:
+        folder = Path(name)
+        write_log(folder / "day.csv", given.rows)
+        size = (folder / "day.csv").stat().st_size
+        steps = (
+            ("init", "day.csv", "--yes"),
+            ("learn", "loop.toml", "day.csv", "-o", "baseline.json"),
+            ("diagnose", "baseline.json", "day.csv"),
+        )
+        rows, largest = [], 0
+        for step in steps:
+            text, wall, cpu, peak = run(*step, folder=folder)
+            verdict = next((line.strip() for line in text.splitlines() if line.startswith("  Healthy")), "")
+            rows.append((step[0], f"{wall:.0f} s", f"{cpu:.0f} s", f"{peak} MB", verdict))
+            largest = max(largest, peak)
+    log = f"{given.rows / 1e6:.0f} million rows, {size / 1e9:.2f} GB"
+    note = f"{log}; goal: {GOAL_MB} MB. Load of the machine: {os.getloadavg()[0]:.0f} on {os.cpu_count()} cores."
+    made = Table("A log of 1 GB", note, ("command", "wall", "CPU", "largest size", "verdict"), tuple(rows))
+    show([made], given.json, {"log": log, "largest": f"{largest} MB"})
+
+
+if __name__ == "__main__":
+    main()
