@@ -29,7 +29,7 @@ AfterOption = Annotated[
 
 
 def add_recordings(
-    path: Path,
+    path: Path | None,
     texts: Sequence[str],
     reading: ReadingOptions,
     as_json: bool,
@@ -41,7 +41,9 @@ def add_recordings(
     accept_delay: bool,
     force: bool,
 ) -> None:
-    """Learn a baseline anew with further recordings, and print what differs."""
+    """Learn a baseline anew with further recordings, and print what differs; None: other options do not go with it."""
+    if path is None:
+        raise typer.BadParameter("--add goes with -b BASELINE, and with neither -o nor the options of other recordings")
     from servoscope.baseline.baseline import Baseline
     from servoscope.cli.render import results
     from servoscope.diagnosis.relearn import relearn

@@ -22,7 +22,7 @@ from servoscope.cli.options import (
     with_reading_options,
 )
 from servoscope.cli.output_paths import REPORTS, TRACES, OutputPaths, check_output
-from servoscope.cli.progress import show_steps
+from servoscope.cli.progress import StepProgress, show_steps
 
 if TYPE_CHECKING:
     from servoscope.signals import Recording
@@ -139,13 +139,11 @@ def learn(
 ) -> None:
     """Learn from healthy recordings what healthy looks like, and from labelled ones what faults look like."""
     if add:
-        if baseline is None or output is not None or nominal or compare is not None or fault or population:
-            raise typer.BadParameter(
-                "--add goes with -b BASELINE, and with neither -o nor the options of other recordings"
-            )
+        others = output is not None or nominal or compare is not None or fault or population
         more = [*add, *([str(loop)] if loop is not None else []), *(healthy or ())]
+        path = None if others else baseline
         add_recordings(
-            baseline, more, reading, as_json, after, why, who, accept_change, accept_delay=accept_delay, force=force
+            path, more, reading, as_json, after, why, who, accept_change, accept_delay=accept_delay, force=force
         )
         return
     if loop is None or output is None:
@@ -185,19 +183,8 @@ def learn(
         settings = settings.model_copy(update={"columns": reader.columns})
     earlier = Baseline.load(compare) if compare is not None else None
     failures = FailureCounter()
-    recordings: dict[str, list[Recording]] = {point: [] for point, _ in named}
-    labels: dict[str, dict[str, list[Recording]]] = {point: {} for point in recordings}
-    with show_steps(len(files) + 1, 6 * max(1, len(recordings))) as steps:
-        for point, path in named:
-            steps.begin(path.name)
-            with failures.catch():
-                recordings[point] += reader.read(path)
-        if failures.count and not any(recordings.values()):
-            failures.exit_if_any()
-        for point, name, path in faults:
-            steps.begin(path.name)
-            with failures.catch():
-                labels[point][name] = labels[point].get(name, []) + reader.read(path)
+    with show_steps(len(files) + 1, 6 * max(1, len(dict(named)))) as steps:
+        recordings, labels = _read_labelled(reader, named, faults, steps, failures)
         steps.begin("learning")
         if nominal:
             learned = nominal_baseline(settings, steps.advance)
@@ -221,6 +208,29 @@ def learn(
         results.print_baseline(results.create_console(), learned)
         results.print_written_path(results.create_console(), output)
     failures.exit_if_any()
+
+
+def _read_labelled(
+    reader: RecordingReader,
+    named: list[tuple[str, Path]],
+    faults: list[tuple[str, str, Path]],
+    steps: StepProgress,
+    failures: FailureCounter,
+) -> tuple[dict[str, list[Recording]], dict[str, dict[str, list[Recording]]]]:
+    """Read healthy recordings, by operating point, and those of faults, by point and name."""
+    recordings: dict[str, list[Recording]] = {point: [] for point, _ in named}
+    labels: dict[str, dict[str, list[Recording]]] = {point: {} for point in recordings}
+    for point, path in named:
+        steps.begin(path.name)
+        with failures.catch():
+            recordings[point] += reader.read(path)
+    if failures.count and not any(recordings.values()):
+        failures.exit_if_any()
+    for point, name, path in faults:
+        steps.begin(path.name)
+        with failures.catch():
+            labels[point][name] = labels[point].get(name, []) + reader.read(path)
+    return recordings, labels
 
 
 @app.command()
