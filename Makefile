@@ -31,23 +31,29 @@ test test-all:
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(SELECTION); tests=$$?; \
 	wait $$types; types=$$?; echo '$(TYPES)'; cat .cache/types.log; exit $$((tests || types))
 
-lint: style     ## format, lint and types, without changing a file
+lint: style     ## format and lint of the whole tree, and types, without changing a file
 	$(TYPES)
 
 style: $(STAMP)
-	$(BIN)/python -m ruff format --check $(CODE)
-	$(BIN)/python -m ruff check $(CODE)
+	$(BIN)/python -m ruff format --check .
+	$(BIN)/python -m ruff check .
 
 format: $(STAMP)  ## put the code into shape
-	$(BIN)/python -m ruff check --fix $(CODE)
-	$(BIN)/python -m ruff format $(CODE)
+	$(BIN)/python -m ruff check --fix .
+	$(BIN)/python -m ruff format .
 
 figures: $(STAMP)  ## run the programs behind the figures of the documents, and print what differs (half an hour)
 	$(BIN)/python scripts/figures.py --run
 
-pictures: $(STAMP)  ## the report in README, and the pages in docs/images/pages, from the browser's tests
+pictures: $(STAMP)  ## the pictures of README and docs, with the record of what they show (half an hour)
 	$(BIN)/servoscope demo -o demo-output
 	$(BIN)/python scripts/screenshot.py demo-output/report.html docs/images/report.png
+	$(BIN)/python benchmarks/steps.py demo-output -o docs/images/steps
+	$(BIN)/python benchmarks/public/overview.py --picture docs/images/benchmarks.svg
+	$(BIN)/python benchmarks/accuracy/run.py --render
+	$(BIN)/python benchmarks/accuracy/nonlinear.py --figure docs/images/nonlinear-rig.png
+	$(BIN)/servoscope reproduce --seeds 20 -o build/paper && cp build/paper/*.png docs/images/paper
+	$(BIN)/python scripts/pictures.py --record
 	SCREENSHOTS=docs/images/pages $(BIN)/python -m pytest -n 0 tests/web/test_web_pages.py tests/web/test_web_action.py tests/web/test_web_files.py
 
 docs: $(STAMP)     ## the site of docs/, as wheels have it: servoscope docs opens it

@@ -86,8 +86,9 @@ def main() -> None:
     given = parser.parse_args()
     table = pq.read_table(given.folder / "trace.parquet")
     trace = {name: table[name].to_numpy() for name in table.column_names}
-    baseline = json.loads((given.folder / "diagnosis.json").read_text(encoding="utf-8"))
-    expected = baseline["reasons"][1]["values"]["changes"][0]["values"]["expected"]
+    diagnosis = json.loads((given.folder / "diagnosis.json").read_text(encoding="utf-8"))
+    changes = next(reason for reason in diagnosis["reasons"] if reason["key"] == "diagnosis.coefficients")
+    expected = changes["values"]["changes"][0]["values"]["expected"]
     given.output.mkdir(parents=True, exist_ok=True)
     with plt.rc_context(STYLE):
         for name, figure in (

@@ -1,4 +1,7 @@
-"""How Sphinx makes the site of these pages: python -m sphinx -W docs SITE; it needs no network, and gives the same bytes each time."""
+"""How Sphinx makes the site of these pages: python -m sphinx -W docs SITE.
+
+It needs no network, and gives the same bytes each time.
+"""
 
 import re
 
@@ -18,7 +21,7 @@ LINK = re.compile(r"^- \[(?P<title>[^]]+)\]\((?P<page>[^)]+)\.md\)", re.M)
 
 
 def add_navigation(app, name, source):
-    """Make each list of pages in index.md a part of the navigation, under its heading: there is no second list to keep."""
+    """Make each list of pages in index.md a part of the navigation, under its heading."""
     if name != "index":
         return
     for heading, text in re.findall(r"^## (.+?)\n(.*?)(?=^## |\Z)", source[0], re.M | re.S):
@@ -80,6 +83,7 @@ def add_synonyms(app, doctree):
 
 
 def setup(app):
+    """Tell Sphinx what to call when it has read a page."""
     app.connect("doctree-read", add_synonyms)
     app.connect("source-read", add_navigation)
     return {"parallel_read_safe": True}

@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from commands import loop_with, one_line, prepared, rows_of, run, write_rows
+from sources import load
 
 import servoscope as ss
 from servoscope.cli import progress
@@ -49,6 +50,10 @@ def test_demo_says_what_it_does_and_leaves_all_its_files(tmp_path: Path) -> None
     (fault,) = diagnosis["faults"]
     assert fault["interval"][0] < 1.2 < fault["interval"][1]
     assert abs(diagnosis["onset_s"][1] - 30.0) < 0.5
+    pictures = load(PROJECT / "scripts" / "pictures.py")
+    shows = pictures.shown_by_report((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
+    drawn = [name for name in pictures.pictures() if name.startswith(pictures.DEMONSTRATION)]
+    assert drawn and [stale for name in drawn if (stale := pictures.stale(name, shows))] == []
 
 
 def test_simulate_tells_the_truth(made: Path, tmp_path: Path) -> None:

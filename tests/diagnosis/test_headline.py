@@ -75,12 +75,12 @@ def refit(*words: str) -> RefitSummary:
             [candidate(0.86, LEAK, STICKY), candidate(0.14, WEAK, LEAK)],
             refit(),
             "Fault since 30.0 s: two faults at once, leakage + friction (86 %) or pump + leakage (14 %). "
-            "This recording cannot tell changes of b_p and p_s apart.",
+            "This recording cannot distinguish changes of b_p and p_s.",
         ),
         (
             [candidate(0.73, GAIN), candidate(0.27, INERTIA)],
             None,
-            "Fault since 30.0 s: input gain (73 %) or inertia (27 %). This recording cannot tell them apart.",
+            "Fault since 30.0 s: input gain (73 %) or inertia (27 %). This recording cannot distinguish them.",
         ),
         (
             [candidate(0.9, LEAK), candidate(0.1)],

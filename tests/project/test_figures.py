@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -11,18 +11,14 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from sources import load
 
 PROJECT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
 def figures() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("figures", PROJECT / "scripts" / "figures.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["figures"] = module
-    spec.loader.exec_module(module)
-    return module
+    return load(PROJECT / "scripts" / "figures.py")
 
 
 @pytest.fixture
@@ -136,3 +132,47 @@ def test_quick_programs_print_what_the_pages_say(shared_data: Path) -> None:
         [sys.executable, "scripts/figures.py", "--quick"], cwd=PROJECT, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_pictures_show_what_is_stored(tmp_path: Path) -> None:
+    """Those of the demonstration and of pages are compared where tests make these."""
+    pictures = load(PROJECT / "scripts" / "pictures.py")
+    drawn = {name: pictures.shown_by_results(name) for name in pictures.pictures()}
+    recorded = {name: entry["shows"] for name, entry in pictures.load().items()}
+    assert recorded.keys() == drawn.keys()
+    stale = [pictures.stale(name, shows or recorded[name]) for name, shows in drawn.items()]
+    assert [why for why in stale if why] == []
+    other = tmp_path / pictures.IMAGES
+    shutil.copytree(PROJECT / pictures.IMAGES, other)
+    assert "shows something older" in pictures.stale("report.png", "another report", tmp_path)
+    (other / "report.png").write_bytes((other / "growth.png").read_bytes())
+    assert "is not the recorded one" in pictures.stale("report.png", recorded["report.png"], tmp_path)
+
+
+def test_the_same_page_has_the_same_hash_at_another_time() -> None:
+    pictures = load(PROJECT / "scripts" / "pictures.py")
+    assert pictures.shown_by_page(["Fleet", "Alarms 3"]) == pictures.shown_by_page(["Fleet", "Alarms 12"])
+    assert pictures.shown_by_page(["Fleet", "Begin"]) != pictures.shown_by_page(["Fleet"])
+    report = "<head><title>x</title></head><h1>Fault: <b>leakage</b></h1><svg>{}</svg>"
+    assert pictures.shown_by_report(report.format(1)) == pictures.shown_by_report(report.format(2))
+    assert pictures.shown_by_report(report) != pictures.shown_by_report(report.replace("leakage", "pump"))
+
+
+MEASURED = ("README", "accuracy", "benchmarks", "fleet", "how-it-works", "nonlinear-rig", "paper", "reliability")
+MEASURED = (*MEASURED, "before-deployment", "results", "speed")
+DATE = re.compile(r"[Mm]easured\W+(?:on )?20\d\d-\d\d-\d\d, commit `[0-9a-f]{7}`|Estimate|one run of \w+ 20\d\d")
+NO_MEASUREMENTS = ("paper.md: ## Where each equation is", "nonlinear-rig.md: ## Simulation")
+FIGURE = re.compile(r"(?<![\w`])\d+(?:\.\d+)?")
+
+
+def test_a_table_of_measured_figures_has_a_program_or_a_date() -> None:
+    """Between markers, or in a section that says when it was measured: not everything can be measured again in CI."""
+    undated = []
+    for page in [PROJECT / "README.md", *(PROJECT / "docs").rglob("*.md")]:
+        text = page.read_text(encoding="utf-8")
+        for section in re.split(r"^(?=#+ )", text, flags=re.M) if page.stem in MEASURED else ():
+            own = re.sub(r"<!-- table .*?<!-- end -->|`[^`]*`|\]\([^)]*\)", "", section, flags=re.S)
+            rows = [line for line in own.splitlines() if line.startswith("|") and "<!-- value" not in line]
+            if sum(bool(FIGURE.search(row)) for row in rows) > 2 and not DATE.search(section):
+                undated.append(f"{page.name}: {section.splitlines()[0]}")
+    assert set(undated) == set(NO_MEASUREMENTS)

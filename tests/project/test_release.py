@@ -126,6 +126,7 @@ def test_every_version_that_is_named_has_its_section(project: Path) -> None:
     sections = re.findall(r"^## \[(\d+\.\d+\.\d+)\] - \d{4}-\d\d-\d\d$", changes, re.M)
     assert sections[0] == version_of(project) and len(set(sections)) == len(sections)
     assert f"version: {sections[0]}\n" in (project / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"servoscope-{sections[0]}-py3" in (project / "README.md").read_text(encoding="utf-8")
     named = set(re.findall(r"\bversion (\d+\.\d+(?:\.\d+)?)\b", changes))
     assert all(any(f"{section}.".startswith(f"{name}.") for section in sections) for name in named)
 

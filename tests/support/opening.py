@@ -98,16 +98,21 @@ def users(config: Path) -> str:
 
 
 def shot(page: Any, name: str, **how: Any) -> None:
-    """Write a picture for the docs, where one is asked for."""
-    folder = os.environ.get("SCREENSHOTS")
-    if folder:
-        page.mouse.move(0, 0)
-        page.wait_for_timeout(600)
-        path = Path(folder) / f"{name}.png"
-        page.screenshot(path=path, **how)
-        Image.open(path).convert("RGB").quantize(64).save(
-            path, optimize=True
-        )  # a third of the size, in the same colours
+    """Write a picture for the docs, where one is asked for; else compare what it shows with the one that is there."""
+    from sources import load  # not above: this file is a plugin of all tests, also of those in a copy without scripts
+
+    pictures, picture = load(Path(__file__).resolve().parents[2] / "scripts" / "pictures.py"), f"pages/{name}.png"
+    words = page.eval_on_selector_all("nav a, h1", "all => all.filter(e => e.checkVisibility()).map(e => e.innerText)")
+    shows, folder = pictures.shown_by_page(words), os.environ.get("SCREENSHOTS")
+    if not folder:
+        assert pictures.stale(picture, shows) == "", words
+        return
+    page.mouse.move(0, 0)
+    page.wait_for_timeout(600)
+    path = Path(folder) / f"{name}.png"
+    page.screenshot(path=path, **how)
+    Image.open(path).convert("RGB").quantize(64).save(path, optimize=True)  # a third of the size, in the same colours
+    pictures.record(picture, shows)
 
 
 def accessible(page: Any) -> None:

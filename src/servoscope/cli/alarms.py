@@ -15,6 +15,7 @@ from servoscope.cli.options import JsonOption, ReasonOption, UserOption
 from servoscope.cli.service import AssetOption, StoreArgument, open_store
 from servoscope.core.errors import AlarmError
 from servoscope.core.messages import message
+from servoscope.core.settings_errors import suggest_name
 
 alarms_app = typer.Typer(no_args_is_help=True, help="List alarms, and ask for what operators may do with them.")
 app.add_typer(alarms_app, name="alarms")
@@ -77,8 +78,17 @@ add_command("return", "return_to_service", "Return it to service.")
 def send_command(
     store: str, asset: str, alarm: str, command: str, who: str | None, reason: str, for_s: float | None = None
 ) -> None:
-    """Write a command into the store, and wait a little for the service to execute it."""
+    """Write a command into the store, and wait a little for the service to execute it.
+
+    Raises AlarmError if the service file has no such alarm, whether the service runs or not.
+    """
+    from servoscope.service.config import ServiceFile
+
     opened = open_store(store, [asset])
+    kind, _, _ = alarm.partition(".")  # a connection's alarm has the name of its source behind a dot
+    known = ServiceFile.load(store).alarms.definitions if store.endswith(".toml") else (kind,)
+    if kind not in known:
+        raise AlarmError(f"{asset}: has no alarm {alarm!r}, {suggest_name(alarm, known)}")
     number = opened.add_command(who or getpass.getuser(), asset, alarm, command, reason=reason, for_s=for_s)
     deadline = time.monotonic() + COMMAND_TIMEOUT_S
     while (outcome := opened.command_outcome(number)) is None and time.monotonic() < deadline:

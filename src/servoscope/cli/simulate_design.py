@@ -98,7 +98,7 @@ def design(
     as_json: JsonOption = False,
     report: Annotated[Path | None, typer.Option(metavar="FILE.html", help="Write a page with plots.")] = None,
 ) -> None:
-    """Say which faults can be detected and told apart, from which size on: of a loop file, or of a baseline alone."""
+    """Say which faults can be detected and isolated, from which size on: of a loop file, or of a baseline alone."""
     check_output(report, "--report", REPORTS, [loop, *(healthy or [])])
     arguments.check_reference(reference)
 

@@ -126,7 +126,7 @@ def _undetected_message(name: str, exams: Sequence[Examination]) -> str:
     subject = f"{exams[0].recording.name} does not differ" if one else f"none of {len(exams)} recordings of it differs"
     return (
         f"{name}: {subject} from healthy (T² reaches {share:.0%} of its limit), and a fault that does not show cannot "
-        "be learned: record it more severe, under livelier motion or at another load"
+        "be learned: record it more severe, under motion with more excitation or at another load"
     )
 
 

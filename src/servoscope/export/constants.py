@@ -68,7 +68,7 @@ class ExportConstants:
             )
         if baseline.features is not None and not only_coefficients:
             raise BaselineError(
-                f"{loop.name}: the features beside the coefficients cannot be exported: learn a baseline with "
+                f"{loop.name}: features cannot be exported: learn a baseline with "
                 "[monitor] feature_false_alarms = 0, or give --only-coefficients"
             )
         derived = MonitorConstants.from_baseline(baseline)

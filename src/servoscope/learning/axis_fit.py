@@ -85,7 +85,7 @@ def check_motion(recordings: Sequence[Recording], signals: Sequence[AxisSignals]
         if (usable := int(one.moving(slow, 0).sum())) < fewest:
             raise NotEnoughError(
                 f"{recording.name}: it moves in {usable} samples only, of at least {fewest}: leave it out, or record a "
-                "livelier motion"
+                "motion with more excitation"
             )
 
 

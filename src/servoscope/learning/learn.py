@@ -94,8 +94,8 @@ def learn_baseline(
     except np.linalg.LinAlgError as error:
         names = ", ".join(rec.name for rec in recordings[:3])
         raise NotEnoughError(
-            f"{names}: the motion does not tell the coefficients apart ({error}): record livelier motion, or take a "
-            "plant with fewer of them"
+            f"{names}: the motion does not distinguish the coefficients ({error}): record a motion with more "
+            "excitation, or take a plant with fewer of them"
         ) from None
 
 

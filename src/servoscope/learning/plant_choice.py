@@ -124,7 +124,7 @@ def choose_plant(
         candidates += _judge_cylinders(lambda plant: folds(_loop(rate, cutoff, plant)), most, contacts)
     plausible = [candidate for candidate in candidates if candidate.plausible]
     if not plausible:
-        raise NotEnoughError("it moves too little to compare plants: record a livelier or longer motion")
+        raise NotEnoughError("it moves too little to compare plants: record a longer motion, or more excitation")
     best = max(plausible, key=lambda candidate: candidate.worth)
     supported = min(
         (candidate for candidate in plausible if _is_as_good(candidate, best)),

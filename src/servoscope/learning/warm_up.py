@@ -65,7 +65,7 @@ def _principal_direction(sums: Sequence[BlockSums], fit: TuningFit) -> tuple[Flo
                 found.append((solve_scaled(A, b), A))
                 whose.append(i)
     if len(found) < 3:
-        raise NotEnoughError("too short to tell what a warm-up does: record longer, from a cold start on")
+        raise NotEnoughError("too short to show what a warm-up does: record longer, from a cold start on")
     theta, A = (np.array(column) for column in zip(*found, strict=True))
     std = np.sqrt(fit.tuning.R * np.array([np.diag(np.linalg.inv(one)) for one in A]))
     proportional = (np.sign(theta) == np.sign(theta[0])).all(axis=0) & (

@@ -17,6 +17,7 @@ from servoscope.research.paper.conditions import (
     FREQUENCIES,
     PAPER,
     TRACKING_CASE,
+    OperatingConditions,
     default_loop,
     paper_loop,
     rig_loop,
@@ -88,21 +89,22 @@ def tracking_metrics(seed: int) -> dict[str, float]:
     return values
 
 
-def bias_metrics() -> dict[str, float]:
-    """Return the error of the iFRF without any noise, by least squares over the profile without its first 10 s.
+def bias_metrics(conditions: OperatingConditions = PAPER) -> dict[str, float]:
+    """Return the error of the iFRF without any noise, by least squares over a reference without its first 10 s.
 
     Regressions of the simulated u and y: Tustin as printed, with (u(k) + u(k-1))/2 for the held input, and the
     state-variable filter, which holds u exactly; and Tustin once more on a loop whose u runs in straight lines between
     the samples, as Tustin takes it ("tustin-straight"). What that removes is due to the hold.
     """
     values: dict[str, float] = {}
-    restart = np.arange(len(PAPER.reference_signal())) == 0
+    r = conditions.reference_signal()
+    restart = np.arange(len(r)) == 0
     straight = Loop.from_dict({**rig_loop(structure="tustin").to_dict(), "hold": "foh"})
     loops = {structure: rig_loop(structure=structure) for structure in ("tustin", "tustin-held", "svf")}
     for name, loop in {**loops, "tustin-straight": straight}.items():
-        u, y = simulate_response(loop, PAPER.reference_signal())
+        u, y = simulate_response(loop, r)
         pipeline = Pipeline.of(loop)
-        g = pipeline.regression(PAPER.reference_signal(), u, y, restart)
+        g = pipeline.regression(r, u, y, restart)
         phi, eta = g.phi[1000:], g.eta[1000:]
         E = pipeline.bank.E(FREQUENCIES)
         nominal = E @ nominal_theta(loop)
