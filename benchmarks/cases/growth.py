@@ -79,7 +79,7 @@ def operations(c: RecursionConstants) -> float:
     evaluation = EvaluationSteps(recursion._spec)
     evaluation.write_evaluation(row, s, h, q)
     for f in range(recursion.sizes.frequencies):
-        evaluation.write_response(row, s, f, q)
+        evaluation.write_response(row, s, h, f, q)
     return each + Tally.done / c.every
 
 

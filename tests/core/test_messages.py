@@ -26,6 +26,7 @@ from servoscope.core.messages import (
     render,
     text_message,
 )
+from servoscope.core.number_format import format_rough
 from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, Mimic
 
 SOURCES = sorted((Path(__file__).parents[2] / "src" / "servoscope").rglob("*.py"))
@@ -216,3 +217,11 @@ def test_another_language_replaces_the_wording_and_nothing_else(
         catalogue.cache_clear()
     monkeypatch.undo()
     assert diagnosis.model_dump_json() == english
+
+
+def test_a_rough_number_has_two_digits_and_no_exponent() -> None:
+    numbers = {0.0123: "0.012", 4.34: "4.3", 43.2: "43", 99.4: "99", 99.6: "100", 143.0: "140", 1234.0: "1200"}
+    assert {x: format_rough(x) for x in numbers} == numbers
+    assert "by 100 %" in str(
+        messages.message("change.risen", name="x", amount=messages.message("fraction.percent", percent=101.0))
+    )

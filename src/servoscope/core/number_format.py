@@ -33,6 +33,11 @@ def format_short(value: float) -> str:
     return f"{value:.0f}" if 100.0 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
+def format_rough(value: float) -> str:
+    """Return a value to two digits, without an exponent where it is merely large."""
+    return f"{float(f'{value:.2g}'):.0f}" if 99.5 <= abs(value) < 1e6 else f"{value:.2g}"
+
+
 def format_share(share: float) -> str:
     """Return a share in per cent: 99.3 %, and 99.97 % rather than 100 %."""
     left = 1.0 - share

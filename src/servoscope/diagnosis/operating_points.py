@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -150,6 +151,8 @@ def _thin_out(loop: Loop, recordings: Sequence[Recording]) -> list[Recording]:
 
 def _judge_whole(baseline: Baseline, whole: Sequence[Recording], learned: Sequence[Recording]) -> list[Message]:
     """Return what recordings are as a whole to a baseline that was learned from stretches of them."""
+    if sum(one.samples for one in learned) < sum(one.samples for one in whole):
+        gc.collect()  # what learning leaves in circles, a hundred megabytes, would add to what a long diagnosis takes
     return [
         message("learning.stretches", recording=one.name, rows=part.samples, of=one.samples, found=found.headline)
         for one, part in zip(whole, learned, strict=True)

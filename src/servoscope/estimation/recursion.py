@@ -51,13 +51,13 @@ class EvaluationConstants(NamedTuple):
     origin: FloatArray
     response: FloatArray
     rate: float
-    settled_covariance: FloatArray
-    settled: float
+    settled_covariance: FloatArray | None = None
+    settled: float = np.inf
 
     @property
     def fades(self) -> bool:
         """Whether the covariance is another one once the estimate has settled."""
-        return not np.array_equal(self.covariance, self.settled_covariance)
+        return self.settled_covariance is not None and not np.array_equal(self.covariance, self.settled_covariance)
 
 
 class RecursionConstants(NamedTuple):
@@ -392,7 +392,8 @@ def _pack_constants(c: RecursionConstants, spec: KernelSpec) -> FloatArray:
             "response": [np.concatenate([(e @ c.basis).ravel(), e @ view.origin]) for e in E],
         }
         if spec.sizes.fades:
-            values |= {"settled_prior": back @ view.settled_covariance @ back.T, "settled": view.settled}
+            settled = view.covariance if view.settled_covariance is None else view.settled_covariance
+            values |= {"settled_prior": back @ settled @ back.T, "settled": view.settled}
     row = np.zeros(places["tail"] + members.size)
     for name, value in values.items():
         row[places[name] : places[name] + np.size(value)] = np.ravel(value)

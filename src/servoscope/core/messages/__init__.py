@@ -30,7 +30,7 @@ from zoneinfo import ZoneInfo
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, field_validator
 
-from servoscope.core.number_format import format_share, format_short
+from servoscope.core.number_format import format_rough, format_share, format_short
 
 __all__ = [
     "FORMATS",
@@ -228,6 +228,7 @@ def _format_utc(value: float) -> str:
 
 
 FORMATS: Mapping[str, Callable[[Any], str]] = {
+    "rough": format_rough,
     "short": format_short,
     "percent": lambda value: f"{100.0 * value:.3g} %",
     "share": format_share,

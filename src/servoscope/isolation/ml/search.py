@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 
@@ -240,11 +240,7 @@ class _HypothesisSearch:
         The recursion's onset may be far off where a fault moves its coefficients along a curve, as oil does; the alarm
         is never far behind. Sizes that fit a wrong onset may be stuck: a grid over all sizes is searched each time.
         """
-        grids = [SizeGrid.from_window(self.window, fault, d) for fault in self.faults]
-        begin = min(
-            sorted({self.initial_onset, self.latest}),
-            key=lambda k: min(float(grid.sums_of_squares(self.window, ChangeProfile(k)).min()) for grid in grids),
-        )
+        d, grids, begin = self._choose_start(d)
         singles = self._fit_each_fault(ChangeProfile(begin), d, grids)
         for drifts in (False, True):
             for _ in range(MAX_LOOKS):
@@ -257,6 +253,23 @@ class _HypothesisSearch:
                 if gained < MIN_LOOK_GAIN * self.noise_variance:
                     break
         return found, singles
+
+    def _choose_start(self, d: FloatArray) -> tuple[FloatArray, list[SizeGrid], int]:
+        """Return healthy parameters, a grid per fault, and an onset: where all of them together cost least.
+
+        Healthy parameters that follow may have taken over a fault that was there from the first sample on.
+        """
+        healthy, onsets = [d], {self.initial_onset, self.latest}
+        if self.window.follows:
+            healthy, onsets = [d, np.zeros_like(d)], {0, *onsets}
+        starts = [(z, [SizeGrid.from_window(self.window, fault, z) for fault in self.faults]) for z in healthy]
+
+        def cost(start: tuple[FloatArray, list[SizeGrid]], onset: int) -> float:
+            prior, profile = self.window.prior @ start[0], ChangeProfile(onset)
+            return float(min(grid.sums_of_squares(self.window, profile).min() for grid in start[1]) + prior @ prior)
+
+        (d, grids), begin = min(product(starts, sorted(onsets)), key=lambda choice: cost(*choice))
+        return d, grids, begin
 
     def _fit_each_fault(
         self, profile: ChangeProfile, d: FloatArray, grids: Sequence[SizeGrid], known: Sequence[HypothesisFit] = ()
