@@ -71,7 +71,9 @@ class AxisModel(BaseModel):
     def visible_faults(self, faults: Sequence[Fault]) -> tuple[Fault, ...]:
         """Return those faults that multiply something that the healthy recordings show."""
         both = {"viscous_friction": BY_DIRECTION} if "viscous_friction" not in self.coefficients else {}
-        return tuple(one for one in faults if not set(both.get(one.parameter, (one.parameter,))) <= set(self.unseen))
+        return tuple(
+            fault for fault in faults if not set(both.get(fault.parameter, (fault.parameter,))) <= set(self.unseen)
+        )
 
     def at(self, factors: Mapping[str, float], shifts: Mapping[str, float]) -> AxisModel:
         """Return the axis at some covariates: coefficients multiplied or, where no factor is known, shifted."""

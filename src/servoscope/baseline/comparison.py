@@ -52,8 +52,8 @@ def compare_baselines(before: Baseline, after: Baseline) -> tuple[BaselineDiffer
 
     Raises BaselineError if they are of different plants, or have no operating point in common.
     """
-    later = {each.point: each for each in after.per_point}
-    pairs = [(each, later[each.point]) for each in before.per_point if each.point in later]
+    later = {baseline.point: baseline for baseline in after.per_point}
+    pairs = [(baseline, later[baseline.point]) for baseline in before.per_point if baseline.point in later]
     if not pairs or any(a.names != b.names for a, b in pairs):
         raise BaselineError("the baselines are of different plants or operating points, there is nothing to compare")
     return tuple(BaselineDifference(a.point, _moves(a, b), _detectable_sizes(a, b)) for a, b in pairs)
@@ -75,8 +75,8 @@ def _moves(a: Baseline, b: Baseline) -> tuple[ParameterMove, ...]:
 
 
 def _detectable_sizes(a: Baseline, b: Baseline) -> tuple[DetectableSizes, ...]:
-    later = {(each.name, each.parameter): each.change for each in b.detectability.changes}
+    later = {(change.name, change.parameter): change.change for change in b.detectability.changes}
     return tuple(
-        DetectableSizes(each.name, each.parameter, each.change, later.get((each.name, each.parameter)))
-        for each in a.detectability.changes
+        DetectableSizes(change.name, change.parameter, change.change, later.get((change.name, change.parameter)))
+        for change in a.detectability.changes
     )

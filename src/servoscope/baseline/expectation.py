@@ -268,7 +268,7 @@ class MeanPropagator:
     ) -> None:
         self._pipeline, self._tuning = expectation.pipeline, expectation.tuning
         self._undisturbed = NoiseFreeRegression(self._pipeline, plant, faulty, onset)
-        moments = [expectation.moments(each) for each in self._undisturbed.plants]
+        moments = [expectation.moments(plant) for plant in self._undisturbed.plants]
         self._moments = np.array([m.c for m in moments]), np.array([m.S for m in moments])
         self._start = np.array(start, dtype=np.float64)
         self._theta, self._samples = self._start.copy(), 0

@@ -129,7 +129,7 @@ class FeatureModel(_FeatureRecord):
         """Return the model at some covariates (k,), which recordings need not have then."""
         if not self.covariates:
             return self
-        groups = [one.at(covariates) for one in self.statistics]
+        groups = [statistic.at(covariates) for statistic in self.statistics]
         # anew: a copy would keep the statistics of these groups
         return type(self).model_validate(self.model_dump() | {"groups": tuple(groups), "covariates": ()})
 
@@ -145,8 +145,9 @@ class FeatureModel(_FeatureRecord):
     def ratios(self, span: SpanFeatures) -> list[float]:
         """Return T^2/d of each group over its limit."""
         return [
-            one.score(*one.group.pick(span), span.covariates) / (self.past_limit if one.group.past else self.limit)
-            for one in self.statistics
+            statistic.score(*statistic.group.pick(span), span.covariates)
+            / (self.past_limit if statistic.group.past else self.limit)
+            for statistic in self.statistics
         ]
 
     def is_familiar(self, span: SpanFeatures) -> bool:
@@ -181,8 +182,8 @@ class FeatureModel(_FeatureRecord):
                 others = group.model_copy(
                     update={"means": np.delete(values, i, axis=0), "covariates": np.delete(c, i, axis=0)}
                 )
-                one = GroupStatistic.of(others, drift=False)
-                scores[i] = max(scores[i], one.score(values[i], group.windows, c[i]))
+                statistic = GroupStatistic.of(others, drift=False)
+                scores[i] = max(scores[i], statistic.score(values[i], group.windows, c[i]))
         return float((scores >= scores[-1]).sum()) / (n + 1.0)
 
 
@@ -278,7 +279,7 @@ def fit_groups(
     found = []
     for level in range(layout.levels):
         rows = [np.array([w.features for w in windows if w.level == level]) for windows in recordings]
-        if not all(len(each) for each in rows):
+        if not all(len(row) for row in rows):
             continue
         for part in layout.groups:
             columns = np.arange(layout.size)[part]
@@ -286,7 +287,7 @@ def fit_groups(
             if not len(kept):
                 continue
             M = means[:, level, kept]
-            apart = np.concatenate([each[:, kept] - mean for each, mean in zip(rows, M, strict=True)])
+            apart = np.concatenate([row[:, kept] - mean for row, mean in zip(rows, M, strict=True)])
             apart = np.where(np.isfinite(apart), apart, 0.0)
             degrees = max(len(apart) - len(M), 1)
             group = FeatureGroup(
@@ -307,7 +308,7 @@ def fit_groups(
 def _own_past(group: FeatureGroup, spans: Sequence[Sequence[SpanFeatures]]) -> FeatureGroup | None:
     """Return the group of the same features, later windows less earlier ones; None where recordings show none."""
     past = group.model_copy(update={"past": True, "covariates": ()})
-    picked = [[past.pick(span) for span in each if span.shift.size] for each in spans]
+    picked = [[past.pick(span) for span in span_features if span.shift.size] for span_features in spans]
     if not all(picked):
         return None
     means = np.array([np.mean([values for values, _ in each], axis=0) for each in picked])

@@ -22,7 +22,7 @@ def read_history(path: Path) -> dict[int, Baseline]:
     Raises BaselineError if one of them cannot be read.
     """
     earlier = [Baseline.load(file) for file in sorted(history_folder(path).glob("*.json"))]
-    return {each.revision.number: each for each in (*earlier, Baseline.load(path))}
+    return {baseline.revision.number: baseline for baseline in (*earlier, Baseline.load(path))}
 
 
 def replace_baseline(path: Path, baseline: Baseline) -> None:

@@ -125,7 +125,7 @@ def learn_sensors(loop: Loop, recordings: Sequence[Recording]) -> SensorModel | 
         limit=_cusum_limit(loop, len(names)),
         repeats=max(REPEATS, 1 + 2 * max(int(_repeats(x).max(initial=0)) for x in values)),
     )
-    worst = max(float(level.max(initial=0.0)) for one in parts for level in _levels(model, one))
+    worst = max(float(level.max(initial=0.0)) for part in parts for level in _levels(model, part))
     return model.model_copy(update={"limit": max(model.limit, LIMIT_MARGIN * worst)})
 
 
@@ -144,7 +144,7 @@ def find_sensor_deviation(
     blocks = _blocks(x, model.samples)
     levels = _levels(model, blocks)
     alarms = [np.flatnonzero((level > model.limit).any(axis=1)) for level in levels]
-    at = [int(found[0]) if found.size else len(blocks.median) for found in alarms]
+    at = [int(alarm[0]) if alarm.size else len(blocks.median) for alarm in alarms]
     first = min(at)
     still = np.argwhere(_repeats(x) >= model.repeats)
     if still.size and still[0, 0] < (first + 2) * model.samples:  # its jump may be seen a block before

@@ -71,22 +71,22 @@ def parse_healthy(texts: Sequence[str]) -> list[tuple[str, Path]]:
 
     A file whose whole name exists is taken as it is.
     """
-    found = []
+    healthy = []
     for text in texts:
         named = re.fullmatch(r"(\w[\w-]*)=(.+)", text)
         point, path = (named[1], Path(named[2])) if named and not Path(text).exists() else ("", Path(text))
-        found += [(point, each) for each in expand_files([path])]
-    without = [path for point, path in found if not point]
-    if 0 < len(without) < len(found):
+        healthy += [(point, each) for each in expand_files([path])]
+    without = [path for point, path in healthy if not point]
+    if 0 < len(without) < len(healthy):
         raise typer.BadParameter(
             f"{without[0]}: name the operating point of each recording, as in cold=a.csv, or of none"
         )
-    return found
+    return healthy
 
 
 def parse_labelled(texts: Sequence[str], points: Sequence[str]) -> list[tuple[str, str, Path]]:
     """Read ``--fault`` of ``learn``: point, name and file; ``backlash@warm=a.csv`` is one at the point warm."""
-    found = []
+    labelled = []
     for text in texts:
         named = re.fullmatch(r"(\w[\w-]*)(?:@(\w[\w-]*))?=(.+)", text)
         if named is None:
@@ -95,25 +95,25 @@ def parse_labelled(texts: Sequence[str], points: Sequence[str]) -> list[tuple[st
         if point not in points:
             where = f"at one of {', '.join(points)}, as in {name}@{points[0]}={file}" if any(points) else "at no point"
             raise typer.BadParameter(f"--fault {text!r}: the healthy recordings are {where}")
-        found.append((point, name, file))
-    return found
+        labelled.append((point, name, file))
+    return labelled
 
 
 def parse_conditions(texts: Sequence[str]) -> dict[str, str]:
     """Read ``--where``: ``["load=20,run=1-5"]`` is {"load": "20", "run": "1-5"}; ``run=1,3`` is one."""
-    found: dict[str, str] = {}
+    conditions: dict[str, str] = {}
     for text in texts:
         column = ""
         for part in text.split(","):
             name, equals, value = part.partition("=")
             if equals:
                 column = name.strip()
-                found[column] = value.strip()
+                conditions[column] = value.strip()
             elif column:
-                found[column] += f",{part.strip()}"
-            if not column or not found[column]:
+                conditions[column] += f",{part.strip()}"
+            if not column or not conditions[column]:
                 raise typer.BadParameter(f"--where {text!r}: write COLUMN=VALUE, as in load=20,run=1-5")
-    return found
+    return conditions
 
 
 def parse_mapping(text: str | None, base: Columns | None = None) -> Columns | None:

@@ -86,7 +86,7 @@ def print_difference(
 
     differences = compare_baselines(before, after)
     if as_json:
-        points = [each.to_dict() for each in differences]
+        points = [difference.to_dict() for difference in differences]
         revision = after.revision.model_dump(mode="json")
         print_json(
             {"before": before.hash, "after": after.hash, "revision": revision, "points": points, **(more or {})},
@@ -94,9 +94,9 @@ def print_difference(
         )
         return
     out = results.create_console()
-    for each in differences:
-        if each.point:
-            results.print_title(out, each.point, "")
+    for difference in differences:
+        if difference.point:
+            results.print_title(out, difference.point, "")
         moves = [
             (
                 row.name,
@@ -105,12 +105,12 @@ def print_difference(
                 _signed(row.change),
                 "" if row.certain else "within its scatter",
             )
-            for row in each.moves
+            for row in difference.moves
         ]
         results.print_table(out, ("parameter", "before", "after", "change", ""), moves)
         sizes = [
             (row.name, *("never" if size is None else format_percent(size) for size in (row.before, row.after)))
-            for row in each.detectable
+            for row in difference.detectable
         ]
         results.print_table(out, ("fault", "detected from, before", "after"), sizes)
 
@@ -128,11 +128,11 @@ def print_log(path: BaselineArgument, as_json: JsonOption = False) -> None:
 
     rows = [
         {
-            **each.revision.model_dump(mode="json"),
-            "hash": each.hash,
-            "sources": [source.name for point in each.per_point for source in point.sources],
+            **baseline.revision.model_dump(mode="json"),
+            "hash": baseline.hash,
+            "sources": [source.name for point in baseline.per_point for source in point.sources],
         }
-        for each in read_history(path).values()
+        for baseline in read_history(path).values()
     ]
     if as_json:
         print_json(rows, lines=False)

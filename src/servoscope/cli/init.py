@@ -56,7 +56,7 @@ def init(
     if asks and reading.columns is None:
         results.print_channels(out, log, channels)
     axes = [reading.axis] if reading.axis is not None or reading.columns is not None else []
-    axes = axes or [*find_axes([each.name for each in channels])] or [None]
+    axes = axes or [*find_axes([channel.name for channel in channels])] or [None]
     targets = [_axis_file(output, axis) if len(axes) > 1 else output for axis in axes]
     for target in targets:
         if target.exists() and not yes:

@@ -81,10 +81,12 @@ class ReadingOptions:
 def with_reading_options(*left_out: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command the options of `ReadingOptions`, in the place of its parameter ``reading``, but for some."""
     hints = get_type_hints(ReadingOptions, include_extras=True)
-    given = [each for each in fields(ReadingOptions) if each.name not in left_out]
+    given = [field for field in fields(ReadingOptions) if field.name not in left_out]
     options = [
-        inspect.Parameter(each.name, inspect.Parameter.KEYWORD_ONLY, default=each.default, annotation=hints[each.name])
-        for each in given
+        inspect.Parameter(
+            field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=hints[field.name]
+        )
+        for field in given
     ]
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
@@ -96,7 +98,7 @@ def with_reading_options(*left_out: str) -> Callable[[Callable[..., None]], Call
 
         @functools.wraps(command)
         def run(**values: Any) -> None:
-            reading = ReadingOptions(**{each.name: values.pop(each.name) for each in given})
+            reading = ReadingOptions(**{field.name: values.pop(field.name) for field in given})
             command(reading=reading, **values)
 
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

@@ -103,6 +103,6 @@ class OutputPaths:
             found = self.target / f"{free}{self.suffix}"
         else:
             found = self.target.with_name(free + self.target.suffix)
-        if any(_is_same_file(found, each) for each in self.inputs):
+        if any(_is_same_file(found, path) for path in self.inputs):
             raise OutputError(f"{found}: is an input and would be overwritten, name another folder")
         return found

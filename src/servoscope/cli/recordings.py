@@ -337,8 +337,8 @@ def verify(
     if as_json:
         plain = plain_values.to_plain_values(found)
         texts = {
-            "differences": [str(each) for each in found.differences],
-            "remarks": [str(each) for each in found.remarks],
+            "differences": [str(difference) for difference in found.differences],
+            "remarks": [str(remark) for remark in found.remarks],
         }
         print_json({**plain, **texts} if isinstance(plain, dict) else plain, lines=False)
     else:

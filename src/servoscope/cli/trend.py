@@ -74,20 +74,20 @@ def trend(
         if asset is None:
             raise typer.BadParameter(f"{source}: name the asset: --asset NAME")
         series = query_sizes(open_store(source, [asset]), asset, value, begin)
-    found = prognose(series, _find_limit(limit, loop, series, source, asset), coverage)
+    prognosis = prognose(series, _find_limit(limit, loop, series, source, asset), coverage)
     if as_json:
-        print_json(found.model_dump(mode="json", exclude={"headline", "reasons"}), lines=False)
+        print_json(prognosis.model_dump(mode="json", exclude={"headline", "reasons"}), lines=False)
     else:
         from servoscope.cli.render import results
 
         out = results.create_console()
-        out.print(found.summary, highlight=False)
-        results.print_notes(out, found.explanation, "blue", "-")
+        out.print(prognosis.summary, highlight=False)
+        results.print_notes(out, prognosis.explanation, "blue", "-")
     if plot is not None:
         from servoscope.cli.render import results
         from servoscope.report.trend_figure import write_trend_figure
 
-        write_trend_figure(plot, series, found)
+        write_trend_figure(plot, series, prognosis)
         results.print_written_path(results.create_console(stderr=as_json), plot)
 
 
@@ -115,7 +115,7 @@ def _find_limit(text: str, path: Path | None, series: SizeSeries, source: str, a
         loop = Baseline.load(path).loop
     else:
         raise typer.BadParameter(f"--limit {text}: give the loop file, --loop loop.toml")
-    rows = [one for one in operating_limits(loop, [series.name]) if one.kind == text]
+    rows = [limit for limit in operating_limits(loop, [series.name]) if limit.kind == text]
     if not rows:
         raise typer.BadParameter(f"--value {series.name}: is no fault of {path}")
     found = rows[0].side(series.value[-1])

@@ -44,7 +44,7 @@ def parse_ip(host: str) -> IpAddress | None:
 def is_member(host: str, networks: Iterable[str]) -> bool:
     """Tell whether a numeric address belongs to one of the networks; a name belongs to none."""
     address = parse_ip(host)
-    return address is not None and any(address in ipaddress.ip_network(one, strict=False) for one in networks)
+    return address is not None and any(address in ipaddress.ip_network(network, strict=False) for network in networks)
 
 
 def is_internal(host: str) -> bool:

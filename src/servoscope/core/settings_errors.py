@@ -89,7 +89,7 @@ def _resolve_location(model: type[BaseModel], loc: tuple[int | str, ...]) -> tup
         if not choices and len(set(united) - {types.NoneType}) > 1:
             at = Any  # of plain types, the part is pydantic's word for the one that it tried
             continue
-        chosen = next((one for one in choices if part in _tags(one)), None)
+        chosen = next((choice for choice in choices if part in _tags(choice)), None)
         if chosen is not None:
             owner = at = chosen
             continue

@@ -97,10 +97,10 @@ def ambiguous_sizes(scene: Scenario, fault: Fault, up: bool) -> tuple[Span, ...]
 
     def excess(log_x: float) -> float:
         """Return the logarithm of the distance relative to what is needed."""
-        found = at(log_x)
-        if found is None:
+        distances = at(log_x)
+        if distances is None:
             return UNLIMITED_DISTANCE
-        distance = equivalent_distance(misnaming_probability(found.squared))
+        distance = equivalent_distance(misnaming_probability(distances.squared))
         return float(np.log(max(distance, 1e-6) / equivalent_distance(MISNAMED)))
 
     promised = min(

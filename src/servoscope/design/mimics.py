@@ -33,14 +33,14 @@ def mimic_causes(scene: Scenario) -> list[MimicCause]:
     window, plant, m = scene.healthy, scene.baseline.plant, scene.healthy.nuisance_count
     names = tuple(plant.causes)
     J = window.jacobian(np.zeros(m + len(names)), names, scene.profile, slice(m, None))
-    found = [MimicCause(name, text_message(plant.causes[name]), "relative", J[:, i]) for i, name in enumerate(names)]
+    causes = [MimicCause(name, text_message(plant.causes[name]), "relative", J[:, i]) for i, name in enumerate(names)]
     healthy, factory = window.healthy, window.factory
     louder, softer = (factory.predictor(plant, output_gain=1.0 + step) for step in (LOUDER, -LOUDER))
     stronger = factory.predictor(plant.model_copy(update={"input_gain": plant.input_gain * (1.0 + 1j * COMPLEX_STEP)}))
     later = factory.predictor(plant, later_s=DELAY_STEP / scene.loop.sample_rate)
     gain_of_y = (_innovation_column(scene, louder) - _innovation_column(scene, softer)).real / (2.0 * LOUDER)
     return [
-        *found,
+        *causes,
         MimicCause("gain of y", message("design.gain_of_y"), "relative", gain_of_y),
         MimicCause(
             "gain of u",
@@ -84,6 +84,6 @@ def match_mimic(scene: Scenario, cause: MimicCause) -> MimicMatch:
 def _innovation_column(scene: Scenario, changed: Predictor) -> np.ndarray[tuple[int, ...], np.dtype[np.complex128]]:
     """Return innovations (N,) with a changed predictor from the onset on, and nothing for the prior, (N + m,)."""
     window, profile = scene.healthy, scene.profile
-    both = [Predictor(*(part.astype(np.complex128) for part in each)) for each in (window.healthy, changed)]
+    both = [Predictor(*(part.astype(np.complex128) for part in predictor)) for predictor in (window.healthy, changed)]
     e = window.innovations(Predictor.concatenate(both), profile)
     return np.concatenate([e, np.zeros(window.nuisance_count)])

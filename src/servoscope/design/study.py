@@ -91,7 +91,7 @@ def design_study(
     require_exact_predictor(loop)
     samples = round((BEFORE_S + after_s) * loop.sample_rate)
     if recordings:
-        healthy = [as_recording(one, loop) for one in recordings]
+        healthy = [as_recording(recording, loop) for recording in recordings]
         longest = max(healthy, key=lambda rec: rec.samples)
         progress("learning")
         return study(
@@ -157,7 +157,7 @@ def study(
     progress("alarms")
     scene = Scenario.from_baseline(baseline, r, after_s)
     alarms = AlarmPower(scene)
-    lost = {(one.fault, one.kind): one for one in operating_limits(scene.loop)}
+    lost = {(limit.fault, limit.kind): limit for limit in operating_limits(scene.loop)}
     faults = {f.name: _fault(scene, alarms, f, lost, progress) for f in scene.loop.plant.faults}
     progress("mimics")
     columns = scene.project_out_nuisances(scene.sensitivity)
@@ -231,17 +231,17 @@ def _nearest_fault(scene: Scenario, fault: Fault, x: float) -> str:
 
 
 def _mimic(scene: Scenario, cause: mimics.MimicCause) -> MimicStudy:
-    found, amount = mimics.match_mimic(scene, cause), AMOUNTS[cause.unit]
+    match, amount = mimics.match_mimic(scene, cause), AMOUNTS[cause.unit]
     names = [fault.name for fault in scene.loop.plant.faults]
     return MimicStudy(
         name=cause.name,
         words=cause.words,
         amount=amount,
         unit=cause.unit,
-        cosines=dict(zip(names, found.cosine.tolist(), strict=True)),
-        imitates=names[found.fault],
-        looks_like=float(np.exp(amount * found.size)),
-        told_apart=_finite(found.distinguishable_from),
+        cosines=dict(zip(names, match.cosine.tolist(), strict=True)),
+        imitates=names[match.fault],
+        looks_like=float(np.exp(amount * match.size)),
+        told_apart=_finite(match.distinguishable_from),
     )
 
 

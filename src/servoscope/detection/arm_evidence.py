@@ -82,7 +82,7 @@ class ChangeTest:
             off = sizes - size
             covariance = np.einsum("k,kij->ij", onset, term.covariance) + np.einsum("k,ki,kj->ij", onset, off, off)
             found.append(CauseEvidence(cause, total - float(np.log(logs.size)), onset, size, covariance))
-        logs = np.array([each.log_factor for each in found])
+        logs = np.array([evidence.log_factor for evidence in found])
         order = np.argsort(-logs)
         total = float(np.logaddexp.reduce(logs))
         probability = np.exp(logs[order] - total)
@@ -106,7 +106,7 @@ class ChangeTest:
         effect[:, :, len(root) - self._drift.size :] += late[..., None] * drift[:, None]
         r = self._change_vector(g + np.einsum("kij,skj->ski", A, effect))
         factors = (term.log_factors(r) for term in self._terms)
-        logs = np.array([np.logaddexp.reduce(each, axis=1) - np.log(each.shape[1]) for each in factors])
+        logs = np.array([np.logaddexp.reduce(factor, axis=1) - np.log(factor.shape[1]) for factor in factors])
         total = np.logaddexp.reduce(logs, axis=0) - np.log(len(logs))
         return float(np.quantile(total, 1.0 - share))
 

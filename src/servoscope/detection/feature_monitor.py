@@ -140,9 +140,9 @@ class FeatureLanes:
     def __init__(self, assets: Sequence[FeatureMonitor | None], column: int) -> None:
         """`assets`: None for one without features."""
         self._assets, self._column = tuple(assets), column
-        heads = np.array([0 if one is None else one.head for one in assets])
-        self._windows = WindowLanes([None if one is None else one.windows for one in assets], column + heads)
-        in_a_row = np.array([0 if one is None else one.model.in_a_row for one in assets])
+        heads = np.array([0 if asset is None else asset.head for asset in assets])
+        self._windows = WindowLanes([None if asset is None else asset.windows for asset in assets], column + heads)
+        in_a_row = np.array([0 if asset is None else asset.model.in_a_row for asset in assets])
         self._others = np.arange(in_a_row.max()) >= in_a_row[:, None]  # what of the first numbers is no score
 
     def values(self, rows: FloatArray) -> FloatArray:
@@ -166,12 +166,14 @@ class FeatureLanes:
         """
         before, spans = self.values(rows), []
         ended = {asset: [*each] for asset, each in groupby(self._windows.run(rows, r, u, y, restart), itemgetter(0))}
-        for asset, one in enumerate(self._assets):
-            if one is None or not (asset in ended or one.model.covariates):
+        for asset, feature_monitor in enumerate(self._assets):
+            if feature_monitor is None or not (asset in ended or feature_monitor.model.covariates):
                 continue
             windows = (window for _, window in ended.get(asset, ()))
-            found = one.score(rows[asset, self._column : self._column + one.size], windows, channels)
-            spans += [(asset, span.end - 1, span.value) for span in found]
+            scores = feature_monitor.score(
+                rows[asset, self._column : self._column + feature_monitor.size], windows, channels
+            )
+            spans += [(asset, span.end - 1, span.value) for span in scores]
         return FeatureValues(before, spans)
 
 

@@ -43,8 +43,8 @@ def find_louder_noise(recording: Recording, memory_s: float) -> LouderNoise | No
     shortest = max(round(MIN_MEMORIES * memory_s * recording.sample_rate), ORDER)
     if not 2 * shortest + ORDER < recording.samples <= MAX_SAMPLES:
         return None
-    found = [_growth(name, getattr(recording, name), recording, shortest) for name in ("u", "y")]
-    return max(filter(None, found), key=lambda noise: noise.growth, default=None)
+    noises = [_growth(name, getattr(recording, name), recording, shortest) for name in ("u", "y")]
+    return max(filter(None, noises), key=lambda noise: noise.growth, default=None)
 
 
 def _growth(name: str, x: FloatArray, recording: Recording, shortest: int) -> LouderNoise | None:

@@ -48,7 +48,7 @@ class MotionMonitor:
     def __init__(self, pipeline: Pipeline, tuning: Tuning, seen: MotionRange) -> None:
         self._pipeline, self._tuning, self._seen = pipeline, tuning, seen
         self._pipelines = motion_pipelines(pipeline)
-        states = [RegressionRunner(each).state for each in self._pipelines]
+        states = [RegressionRunner(pipeline).state for pipeline in self._pipelines]
         self._filters, self._ends = np.concatenate(states), np.cumsum([len(state) for state in states])[:-1]
         self._length = MEMORIES * pipeline.memory
         depth = int(np.ceil(self._length * pipeline.stride / pipeline.every)) + 1

@@ -84,9 +84,11 @@ def find_signal_defect(recording: Recording, delay_s: float = 0.0) -> SignalDefe
     for chunk in outofcore.iter_chunks(0, recording.samples):
         rows = recording.rows(chunk)
         state, findings = check_block(limits, state, rows.t, rows.r, rows.u, rows.y)
-        found = [_frozen_defect(recording, finding) for finding in findings] + [_find_jump(rows, chunk.start, lead)]
+        signal_defect = [_frozen_defect(recording, finding) for finding in findings] + [
+            _find_jump(rows, chunk.start, lead)
+        ]
         outofcore.release(*recording.columns)
-        if defects := [defect for defect in found if defect is not None]:
+        if defects := [defect for defect in signal_defect if defect is not None]:
             return min(defects, key=lambda defect: defect.begin)
     return None
 
@@ -165,16 +167,16 @@ def describe_misfit(pipeline: Pipeline, theta: FloatArray, recording: Recording)
     rows = recording.rows(slice(0, MAX_ROWS))
     if not _residual_share(pipeline, theta, rows)[0] > MIN_WRONG_SHARE:
         return None
-    found = [
+    corrections = [
         correction
         for correction in find_corrections(pipeline, theta, None, rows)
         if _residual_share(pipeline, theta, correction.apply(rows))[0] < MAX_RIGHT_SHARE
     ]
-    of_u = [correction for correction in found if abs(correction.factors[1]) != 1.0]
-    of_y = [correction for correction in found if abs(correction.factors[2]) != 1.0]
+    of_u = [correction for correction in corrections if abs(correction.factors[1]) != 1.0]
+    of_y = [correction for correction in corrections if abs(correction.factors[2]) != 1.0]
     if of_u and of_y and of_y[0].factors[0] != 1.0:  # r agrees with y, so that both or u may be wrong
         return message("signals.unit_of_either", u=of_u[0].factors[1], y=of_y[0].factors[2])
-    return (of_y or found)[0].description if found else None
+    return (of_y or corrections)[0].description if corrections else None
 
 
 def _single_corrections() -> Iterator[Correction]:

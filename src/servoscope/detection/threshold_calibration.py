@@ -64,7 +64,7 @@ def calibrate_thresholds(
         )
         alarms = (apply_alarm_delays(each, *pipeline.delays) for each in (limit < T2, e.level >= 1.0))
         events += [int((np.diff(alarm.astype(np.int8)) == 1).sum()) for alarm in alarms]
-    return CalibrationFactors(*(_share(float(each), counted * rehearsals) for each in events))
+    return CalibrationFactors(*(_share(float(event), counted * rehearsals) for event in events))
 
 
 def design_sequential_test(

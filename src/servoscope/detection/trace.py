@@ -90,8 +90,8 @@ class Trace(ShortRepr):
         """Return that of one asset of a fleet."""
         part = {name: getattr(self, name)[asset] for name in ASSET_COLUMNS}
         responses = {name: getattr(self, name) for name in ("ifrf", "ifrf_expected")}
-        for name, one in responses.items():
-            part[name] = FrequencyResponse(one.frequencies, one.H[asset], one.covariance[asset])
+        for name, response in responses.items():
+            part[name] = FrequencyResponse(response.frequencies, response.H[asset], response.covariance[asset])
         part["features"] = None if self.features is None else self.features[asset]
         return Trace(self.t, self.names, threshold=float(np.asarray(self.threshold)[asset, 0]), **part)
 

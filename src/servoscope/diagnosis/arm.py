@@ -171,29 +171,29 @@ def _smallest_changes(
     # of one column alone: c^2 R / 2 has to exceed the limit and what the choice among causes costs
     needed = 2.0 * (baseline.limit + np.log(len(baseline.causes)))
     smallest = np.sqrt(needed * (1.0 / np.maximum(np.diag(known)[first:], 1e-300) + np.array(baseline.drift) ** 2))
-    found = [message("arm.smallest_mass", mass=float(smallest[0]))] if smallest[0] < scale[0] else []
+    messages = [message("arm.smallest_mass", mass=float(smallest[0]))] if smallest[0] < scale[0] else []
     for joint, moves in zip(baseline.model.arm.names, moved, strict=True):
-        cause = next(each for each in baseline.causes if each.joint == joint)
+        cause = next(cause for cause in baseline.causes if cause.joint == joint)
         healthy = abs(baseline.coefficient(f"{joint}.{cause.parameter}")[0])
         if moves and healthy > 0.0:
-            found.append(message("arm.smallest", joint=joint, size=float(smallest[cause.columns[0]]) / healthy))
-    return found
+            messages.append(message("arm.smallest", joint=joint, size=float(smallest[cause.columns[0]]) / healthy))
+    return messages
 
 
 def _explain(
     baseline: ArmBaseline, evidence: ChangeEvidence
 ) -> tuple[Verdict, Message, FaultInterval, tuple[Message, ...]]:
     """Return verdict, headline, interval and reasons of a change."""
-    named = [index for index, each in enumerate(evidence.causes) if each.cause.kind != UNKNOWN]
+    named = [index for index, cause in enumerate(evidence.causes) if cause.cause.kind != UNKNOWN]
     explained = evidence.causes[named[0]].log_factor / max(evidence.log_factor, 1e-9)
     remains = named[0] > 0 and explained >= MIN_EXPLAINED
     if remains:  # one cause explains most: what remains is told, and hides no name
         causes = tuple(evidence.causes[index] for index in named)
-        logs = np.array([each.log_factor for each in causes])
+        logs = np.array([cause.log_factor for cause in causes])
         evidence = evidence._replace(causes=causes, probability=np.exp(logs - np.logaddexp.reduce(logs)))
     groups: dict[tuple[str, str], list[int]] = defaultdict(list)
-    for index, each in enumerate(evidence.causes):
-        groups[each.cause.kind, each.cause.joint].append(index)
+    for index, cause_evidence in enumerate(evidence.causes):
+        groups[cause_evidence.cause.kind, cause_evidence.cause.joint].append(index)
     odds = {key: float(evidence.probability[indices].sum()) for key, indices in groups.items()}
     ranked = sorted(odds, key=lambda key: -odds[key])
     best = evidence.causes[groups[ranked[0]][0]]
@@ -243,8 +243,8 @@ def _of(cause: ArmCause) -> Message | None:
 
 def _named_kinds(interval: FaultInterval) -> list[str]:
     """Return the kinds of what is named, or may be."""
-    likely = [each for each in interval.candidates if each.probability >= MIN_RIVAL_PROBABILITY]
-    return list(dict.fromkeys(each.name.partition(" of ")[0] for each in likely))
+    likely = [candidate for candidate in interval.candidates if candidate.probability >= MIN_RIVAL_PROBABILITY]
+    return list(dict.fromkeys(candidate.name.partition(" of ")[0] for candidate in likely))
 
 
 def _onset(evidence: ChangeEvidence, best: CauseEvidence) -> tuple[tuple[float, float, float], bool]:

@@ -40,14 +40,14 @@ def estimate_batch_deviation(exam: Examination, from_s: float, to_s: float = np.
         return _deviation_by_instrument(exam, from_s, to_s)
     try:
         rec = exam.recording.part(from_s, to_s)
-        found = fit_tuning(exam.pipeline, [exam.pipeline.regression(rec.r, rec.u, rec.y, rec.restart)])
+        tuning = fit_tuning(exam.pipeline, [exam.pipeline.regression(rec.r, rec.u, rec.y, rec.restart)])
     except RecordingError as error:
         raise NotEnoughError(f"{name}, from {from_s:.4g} s on: {error}") from None
     expected = np.array(baseline.theta)
     if exam.noise is not None:  # the bias that this reference has under any plant
         bias = Expectation(exam.pipeline, exam.tuning, exam.noise, reference_path(rec)).batch_estimate(baseline.plant)
         expected = expected + bias - np.array(baseline.healthy.theta)
-    return found.each[0] - expected, found.each_covariance[0]
+    return tuning.each[0] - expected, tuning.each_covariance[0]
 
 
 def _deviation_by_instrument(exam: Examination, from_s: float, to_s: float) -> tuple[FloatArray, FloatArray]:
@@ -55,11 +55,11 @@ def _deviation_by_instrument(exam: Examination, from_s: float, to_s: float) -> t
 
     The second half of the stretch speaks where it knows enough: a gradual change is over by then, as a rule.
     """
-    found, end_s = _fit_stretch(exam, from_s, to_s), min(to_s, float(exam.recording.t[-1]))
+    fit, end_s = _fit_stretch(exam, from_s, to_s), min(to_s, float(exam.recording.t[-1]))
     with contextlib.suppress(NotEnoughError):
         half = _fit_stretch(exam, 0.5 * (from_s + end_s), to_s)
-        found = half if half.deviation <= HALF_STRETCH_TOLERANCE else found
-    return found.fit.tuning.theta - np.array(exam.baseline.theta), found.fit.covariance
+        fit = half if half.deviation <= HALF_STRETCH_TOLERANCE else fit
+    return fit.fit.tuning.theta - np.array(exam.baseline.theta), fit.fit.covariance
 
 
 def _fit_stretch(exam: Examination, from_s: float, to_s: float) -> InstrumentalFit:

@@ -165,7 +165,7 @@ def _size_messages(faults: Sequence[FaultEstimate]) -> tuple[Message, ...]:
         size = message("diagnosis.size", parameter=first.parameter, **_size_values(first))
     return (
         size,
-        *(message("diagnosis.size_next", parameter=each.parameter, **_size_values(each)) for each in others),
+        *(message("diagnosis.size_next", parameter=other.parameter, **_size_values(other)) for other in others),
     )
 
 

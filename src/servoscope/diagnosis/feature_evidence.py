@@ -93,9 +93,9 @@ class FeatureEvidence:
         ratios = zip(self.model.statistics, self.model.ratios(span.features), strict=True)
         moved = [
             (name, off)
-            for one, ratio in ratios
+            for statistic, ratio in ratios
             if ratio > 1.0
-            for name, _, _, off in self._compare(one, span)
+            for name, _, _, off in self._compare(statistic, span)
             if abs(off) >= MIN_STD
         ]
         grown = {name.signal for name, off in moved if name.band_hz is not None and off > 0.0}
@@ -106,8 +106,8 @@ class FeatureEvidence:
 
     def _changes(self, span: SpanScore) -> tuple[Message, ...]:
         """Say which features differ, the most changed first: of which signal, in which motion and band."""
-        one = self.model.statistics[int(np.argmax(self.model.ratios(span.features)))]
-        first, *others = sorted(self._compare(one, span), key=lambda row: -abs(row[3]))[:MAX_FEATURES_NAMED]
+        statistic = self.model.statistics[int(np.argmax(self.model.ratios(span.features)))]
+        first, *others = sorted(self._compare(statistic, span), key=lambda row: -abs(row[3]))[:MAX_FEATURES_NAMED]
         return tuple(_describe(*row[:3]) for row in (first, *(row for row in others if abs(row[3]) >= MIN_STD)))
 
     def _compare(self, one: GroupStatistic, span: SpanScore) -> list[tuple[FeatureName, float, float, float]]:

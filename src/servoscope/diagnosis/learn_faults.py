@@ -73,16 +73,16 @@ def _fault_deviation(exam: Examination) -> tuple[FloatArray, FloatArray]:
 
 def _learn_fault(name: str, faulty: Sequence[Examination], healthy: FloatArray) -> LearnedFault:
     deviations, covariances = map(np.array, zip(*map(_fault_deviation, faulty), strict=True))
-    found = fit_learned_fault(name, [exam.recording.name for exam in faulty], deviations, covariances, healthy)
-    if min(found.shares) <= 0.0:
-        odd = found.recordings[int(np.argmin(found.shares))]
+    learned_fault = fit_learned_fault(name, [exam.recording.name for exam in faulty], deviations, covariances, healthy)
+    if min(learned_fault.shares) <= 0.0:
+        odd = learned_fault.recordings[int(np.argmin(learned_fault.shares))]
         raise NotEnoughError(f"{odd} moves theta the other way than the other recordings of {name}: two labels?")
-    if found.distinctness < MIN_DISTINCTNESS_FACTOR * misfit_limit(len(healthy)):
+    if learned_fault.distinctness < MIN_DISTINCTNESS_FACTOR * misfit_limit(len(healthy)):
         raise NotEnoughError(
             f"the {len(faulty)} recordings of {name} differ from each other as much as from healthy, so nearly any "
             "change would look like it: give them different labels, or record more"
         )
-    return found
+    return learned_fault
 
 
 def fit_learned_fault(
@@ -135,8 +135,8 @@ def _confusion_note(baseline: Baseline, name: str, faulty: Sequence[Examination]
     diagnoses = [diagnose_examination(replace(exam, baseline=baseline))[0] for exam in faulty]
     likely = Counter(
         c.name
-        for each in diagnoses
-        for c in each.candidates
+        for diagnosis in diagnoses
+        for c in diagnosis.candidates
         if c.name != name and c.probability >= MIN_PROBABILITY_NOTED
     )
     others = tuple(

@@ -37,8 +37,8 @@ def refit_recording(
     most = MAX_WINDOW_SAMPLES * (1 if axis is None else axis.stride)
     begin = max(onset.sample - most, 0)
     near = exam.recording.rows(slice(begin, onset.sample + most))
-    found = fit_hypotheses(exam.baseline, near, onset.sample - begin, alarm - begin, last - begin, progress)
-    return replace(found, window=replace(found.window, first_sample=found.window.first_sample + begin))
+    hypotheses = fit_hypotheses(exam.baseline, near, onset.sample - begin, alarm - begin, last - begin, progress)
+    return replace(hypotheses, window=replace(hypotheses.window, first_sample=hypotheses.window.first_sample + begin))
 
 
 def vibration_interval(exam: Examination, found: AxisVibration) -> FaultInterval:
@@ -61,11 +61,11 @@ def vibration_interval(exam: Examination, found: AxisVibration) -> FaultInterval
 
 def refit_candidates(refined: RefitResult) -> tuple[Candidate, ...]:
     """Return all single faults, the pairs worth listing and ``unknown``, the most probable first."""
-    least = min(each.fitted.cost for each in refined.hypotheses)
+    least = min(hypothesis.fitted.cost for hypothesis in refined.hypotheses)
     candidates = [
-        _candidate(each, refined.window.plant, least, refined.noise_variance)
-        for each in refined.hypotheses
-        if len(each.fitted.faults) == 1 or each.probability >= MIN_PAIR_PROBABILITY
+        _candidate(hypothesis, refined.window.plant, least, refined.noise_variance)
+        for hypothesis in refined.hypotheses
+        if len(hypothesis.fitted.faults) == 1 or hypothesis.probability >= MIN_PAIR_PROBABILITY
     ]
     candidates.append(Candidate(name=UNKNOWN, probability=refined.unknown_probability))
     # where probabilities vanish, the closest comes first
@@ -119,18 +119,18 @@ def disagreement_warnings(
     exam: Examination, candidates: tuple[Candidate, ...], refit: RefitSummary, sure: float
 ) -> list[DiagnosisWarning]:
     """Return a warning where the refit and the recursion contradict each other, both with probability `sure`."""
-    one, other = candidates[0], refit.recursive[0]
-    if min(one.probability, other.probability) < sure or (len(one.faults) > 1 and other.name == UNKNOWN):
+    candidate, other = candidates[0], refit.recursive[0]
+    if min(candidate.probability, other.probability) < sure or (len(candidate.faults) > 1 and other.name == UNKNOWN):
         return []  # the recursion knows no pairs
     reason = message("warning.disagreement_recency")
-    if len(one.faults) > 1:
+    if len(candidate.faults) > 1:
         reason = message("warning.disagreement_pairs")
     elif refit.over_s > 0.0:
         reason = message("warning.disagreement_growth", over_s=refit.over_s)
-    if one.name != other.name:
-        found = [message("warning.disagreement_faults", refit=one.names, recursion=other.names, reason=reason)]
+    if candidate.name != other.name:
+        messages = [message("warning.disagreement_faults", refit=candidate.names, recursion=other.names, reason=reason)]
     else:
-        found = [
+        messages = [
             message(
                 "warning.disagreement_size",
                 parameter=a.parameter,
@@ -140,10 +140,10 @@ def disagreement_warnings(
                 recursion_digits=ratio_digits(b.ratio, *b.interval),
                 reason=reason,
             )
-            for a, b in zip(one.faults, other.faults, strict=True)
+            for a, b in zip(candidate.faults, other.faults, strict=True)
             if size_distance_std(a, b) > MAX_SIZE_DISTANCE
         ]
-    return [warning_throughout(exam, "disagreement", each) for each in found[-1:]]
+    return [warning_throughout(exam, "disagreement", each) for each in messages[-1:]]
 
 
 def size_distance_std(a: FaultEstimate, b: FaultEstimate) -> float:

@@ -73,7 +73,7 @@ class Monitor:
         self.baselines = tuple(Baseline.of(each) for each in several)
         if not self.baselines:
             raise BaselineError("a monitor needs at least one baseline")
-        distinct = {id(each): each for each in self.baselines}
+        distinct = {id(baseline): baseline for baseline in self.baselines}
         for each in distinct.values():
             if each.others:
                 raise BaselineError(
@@ -86,17 +86,17 @@ class Monitor:
                     "give each asset a monitor of its own"
                 )
         if share_budget:
-            shared = {key: each.shared(len(self.baselines)) for key, each in distinct.items()}
-            self.baselines = tuple(shared[id(each)] for each in self.baselines)
-            distinct = {id(each): each for each in self.baselines}
-        if len({compatibility_key(each) for each in distinct.values()}) > 1:
+            shared = {key: baseline.shared(len(self.baselines)) for key, baseline in distinct.items()}
+            self.baselines = tuple(shared[id(baseline)] for baseline in self.baselines)
+            distinct = {id(baseline): baseline for baseline in self.baselines}
+        if len({compatibility_key(baseline) for baseline in distinct.values()}) > 1:
             raise BaselineError(
                 "the baselines of one monitor must share sample rate, evaluation rate, coefficients and frequencies: "
                 "make one monitor for each kind of loop"
             )
-        constants = {key: MonitorConstants.from_baseline(each) for key, each in distinct.items()}
+        constants = {key: MonitorConstants.from_baseline(baseline) for key, baseline in distinct.items()}
         self._single_precision = precision == "single"
-        self._assemble([constants[id(each)] for each in self.baselines])
+        self._assemble([constants[id(baseline)] for baseline in self.baselines])
         if motion_check:
             if self.fleet:
                 raise BaselineError("the motion of a fleet is not checked: make one monitor for each asset")
@@ -110,14 +110,16 @@ class Monitor:
         self.pipeline = self._constants_of[0].pipeline
         self._groups = self._group_assets()
         self._shared_columns = {
-            "expected": deduplicate([each.expected_theta for each in self._constants_of]),
-            "H": deduplicate([each.healthy.H for each in self._constants_of]),
-            "covariance of H": deduplicate([each.healthy.covariance for each in self._constants_of]),
+            "expected": deduplicate([constants.expected_theta for constants in self._constants_of]),
+            "H": deduplicate([constants.healthy.H for constants in self._constants_of]),
+            "covariance of H": deduplicate([constants.healthy.covariance for constants in self._constants_of]),
         }
-        self._limits = np.array([each.thresholds.statistic for each in self.baselines])[:, None]
-        self._prefix_size = max(each.prefix_size for each in self._constants_of)  # where the state of stage 2 begins
+        self._limits = np.array([baseline.thresholds.statistic for baseline in self.baselines])[:, None]
+        self._prefix_size = max(
+            constants.prefix_size for constants in self._constants_of
+        )  # where the state of stage 2 begins
         self._side_at = self._prefix_size + max(recursion.size for _, recursion in self._groups)
-        self._sides = SideLanes([each.side for each in self._constants_of], self._side_at)
+        self._sides = SideLanes([constants.side for constants in self._constants_of], self._side_at)
         self._size = self._side_at + self._sides.size
         self._step: Callable[[FloatArray, float, float, float], bool] | None = None
 
@@ -130,9 +132,9 @@ class Monitor:
         # of one alone, the recursion would not run in lanes
         monitors = [*monitors, *monitors][: max(2, len(monitors))]
         fleet = cls.__new__(cls)
-        fleet.baselines, fleet.fleet = tuple(each.baselines[0] for each in monitors), True
+        fleet.baselines, fleet.fleet = tuple(monitor.baselines[0] for monitor in monitors), True
         fleet._single_precision = False
-        fleet._assemble([each._constants_of[0] for each in monitors])
+        fleet._assemble([monitor._constants_of[0] for monitor in monitors])
         return fleet
 
     def select(self, assets: npt.NDArray[np.intp]) -> Self:
@@ -169,11 +171,11 @@ class Monitor:
         """Return the assets of each structure, which go through one recursion together."""
         from servoscope.estimation.recursion import Recursion, structure_key
 
-        keys = {id(each): structure_key(each.constants) for each in self._constants_of}
+        keys = {id(constants): structure_key(constants.constants) for constants in self._constants_of}
         members: dict[Hashable, list[int]] = {}
-        for i, each in enumerate(self._constants_of):
-            members.setdefault(keys[id(each)], []).append(i)
-        constants = [each.constants for each in self._constants_of]
+        for i, monitor_constants in enumerate(self._constants_of):
+            members.setdefault(keys[id(monitor_constants)], []).append(i)
+        constants = [constants.constants for constants in self._constants_of]
         return [
             (np.array(assets), Recursion([constants[i] for i in assets], single=self._single_precision))
             for assets in members.values()
@@ -185,8 +187,10 @@ class Monitor:
         for assets, recursion in self._groups:
             states[assets, self._prefix_size : self._prefix_size + recursion.size] = recursion.start()
         if self._prefix_size:
-            for row, each in zip(states, self._constants_of, strict=True):
-                row[: each.prefix_size] = np.concatenate([each.pipeline.valve.start(), each.stage.start()])
+            for row, constants in zip(states, self._constants_of, strict=True):
+                row[: constants.prefix_size] = np.concatenate(
+                    [constants.pipeline.valve.start(), constants.stage.start()]
+                )
         self._sides.start(states)
         return states if self.fleet else states[0]
 
@@ -302,10 +306,10 @@ class Monitor:
     ) -> FloatArray:
         """Return u behind valve law and stage 1, whose states are changed in place."""
         flow = np.empty_like(u)
-        for i, each in enumerate(self._constants_of):
-            valve = each.pipeline.valve
+        for i, constants in enumerate(self._constants_of):
+            valve = constants.pipeline.valve
             behind_valve = valve.run(rows[i, : valve.size], u[i], y[i], flags[i])
-            flow[i] = each.stage.run(rows[i, valve.size : each.prefix_size], r[i], behind_valve, flags[i])
+            flow[i] = constants.stage.run(rows[i, valve.size : constants.prefix_size], r[i], behind_valve, flags[i])
         return flow
 
     def _follow_sides(
@@ -316,14 +320,14 @@ class Monitor:
         channels: Mapping[str, npt.ArrayLike],
     ) -> SideValues:
         """Return what is seen beside the recursions; changes its state, and starts theta where covariates say so."""
-        found = self._sides.run(rows, signals, gaps, channels)
-        if found.averages is not None:  # of one asset
-            signals[0] = np.where(np.isnan(found.averages).any(axis=1), np.nan, signals[0])
-        if found.start is not None:
+        side_values = self._sides.run(rows, signals, gaps, channels)
+        if side_values.averages is not None:  # of one asset
+            signals[0] = np.where(np.isnan(side_values.averages).any(axis=1), np.nan, signals[0])
+        if side_values.start is not None:
             ((_, recursion),), constants = self._groups, self._constants_of[0].constants
             state = rows[:, self._prefix_size : self._prefix_size + recursion.size]
-            recursion.named(state)["theta"][0] = np.linalg.solve(constants.basis, found.start - constants.origin)
-        return found
+            recursion.named(state)["theta"][0] = np.linalg.solve(constants.basis, side_values.start - constants.origin)
+        return side_values
 
     def latest(self, state: FloatArray) -> Trace:
         """Return the trace of the latest evaluation in a state."""

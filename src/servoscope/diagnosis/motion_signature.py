@@ -102,14 +102,16 @@ def signature_columns(recording: Recording, loop: Loop, onset_s: float | None) -
     """
     before, after = compare_signatures(recording, loop, onset_s)
     found = []
-    for words, one in (("before", before), ("after" if before else "measured", after)):
-        if one is not None:
-            widths = {"friction_band": one.friction_band, "lost_motion": one.lost_motion}
-            curves = {name: getattr(one, name) for name in ("position", "forward", "backward", "speed", "by_speed")}
+    for words, signature in (("before", before), ("after" if before else "measured", after)):
+        if signature is not None:
+            widths = {"friction_band": signature.friction_band, "lost_motion": signature.lost_motion}
+            curves = {
+                name: getattr(signature, name) for name in ("position", "forward", "backward", "speed", "by_speed")
+            }
             plain = {
                 name: [None if math.isnan(x) else float(f"{x:.6g}") for x in curve] for name, curve in curves.items()
             }
-            found.append({"words": words, **plain, **{name: list(each) for name, each in widths.items() if each}})
+            found.append({"words": words, **plain, **{name: list(width) for name, width in widths.items() if width}})
     return found
 
 
@@ -126,8 +128,8 @@ def _smoothed(x: FloatArray, restart: BoolArray, window: int, rate: float) -> tu
     weights = [savgol_coeffs(window, 2, deriv=k, delta=1.0 / rate, use="dot") for k in range(3)]
     for start, stop in zip(np.append(0, starts[starts > 0])[:-1], starts[starts > 0], strict=True):
         if stop - start >= window:
-            for row, each in zip(found, weights, strict=True):
-                row[start + half : stop - half] = np.correlate(x[start:stop], each, mode="valid")
+            for row, weight in zip(found, weights, strict=True):
+                row[start + half : stop - half] = np.correlate(x[start:stop], weight, mode="valid")
     return found[0], found[1], found[2]
 
 

@@ -77,7 +77,7 @@ class NoveltyDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
         return np.where(self.decision_function(X) < 0.0, -INLIER, INLIER)
 
     def _excess(self, recording: Recording) -> float:
-        exams = (Examination.from_recording(one, recording) for one in self.baseline_.per_point)
+        exams = (Examination.from_recording(baseline, recording) for baseline in self.baseline_.per_point)
         return min(map(largest_statistic_ratio, exams))
 
     def __sklearn_is_fitted__(self) -> bool:

@@ -151,12 +151,18 @@ def _thin_out(loop: Loop, recordings: Sequence[Recording]) -> list[Recording]:
 
 def _judge_whole(baseline: Baseline, whole: Sequence[Recording], learned: Sequence[Recording]) -> list[Message]:
     """Return what recordings are as a whole to a baseline that was learned from stretches of them."""
-    if sum(one.samples for one in learned) < sum(one.samples for one in whole):
+    if sum(recording.samples for recording in learned) < sum(recording.samples for recording in whole):
         gc.collect()  # what learning leaves in circles, a hundred megabytes, would add to what a long diagnosis takes
     return [
-        message("learning.stretches", recording=one.name, rows=part.samples, of=one.samples, found=found.headline)
-        for one, part in zip(whole, learned, strict=True)
-        if part.samples < one.samples and (found := diagnose(baseline, one))
+        message(
+            "learning.stretches",
+            recording=recording.name,
+            rows=part.samples,
+            of=recording.samples,
+            found=diagnosis.headline,
+        )
+        for recording, part in zip(whole, learned, strict=True)
+        if part.samples < recording.samples and (diagnosis := diagnose(baseline, recording))
     ]
 
 
@@ -173,7 +179,7 @@ def _named_machines(population: Mapping[str, Baseline] | Sequence[Baseline | str
 
 def _machines_at(machines: Mapping[str, Baseline], point: str) -> dict[str, Baseline]:
     """Return the machines' baselines of one operating point; those without points are of any."""
-    return {name: one.at(point) if point in one.points else one for name, one in machines.items()}
+    return {name: machine.at(point) if point in machine.points else machine for name, machine in machines.items()}
 
 
 def _group_by_point(

@@ -90,7 +90,7 @@ def relearn(
     *_, earlier = history.values()
     loop, known = earlier.loop, earlier.revision
     given = recordings if isinstance(recordings, Mapping) else {"": recordings}
-    if strange := set(given) - {each.point for each in earlier.per_point}:
+    if strange := set(given) - {baseline.point for baseline in earlier.per_point}:
         names = ", ".join(earlier.points) or "none"
         raise BaselineError(f"{path}: has no operating point {min(strange)!r}, choose from {names}")
     folders = [path.parent, history_folder(path), *folders]
@@ -103,7 +103,7 @@ def relearn(
         if reference is not earlier:
             compare_with_earlier(reference, point, some, progress, accept_change or after is not None, "first")
     kept: dict[str, list[Recording]] = {}
-    learned = {each.point: each for each in earlier.per_point if each.point in new}
+    learned = {baseline.point: baseline for baseline in earlier.per_point if baseline.point in new}
     for each in () if after in RENEWALS else learned.values():
         kept[each.point], missing = find_sources(each, folders)
         if missing and not leave_out:
@@ -130,7 +130,7 @@ def relearn(
         before = learned[each.point]
         update = {"notes": (*each.notes, *notes.get(each.point, ())), "learned": before.learned}
         learned[each.point] = each.model_copy(update=update)
-    points = [learned.get(each.point, each) for each in earlier.per_point]
+    points = [learned.get(baseline.point, baseline) for baseline in earlier.per_point]
     baseline = points[0].model_copy(update={"others": tuple(points[1:]), "revision": revision})
     if save:
         replace_baseline(path, baseline)

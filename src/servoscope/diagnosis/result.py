@@ -140,9 +140,9 @@ def sum_up(warnings: Sequence[DiagnosisWarning]) -> list[DiagnosisWarning]:
         if kinds[warning.kind] <= MAX_ALIKE:
             summed[str(number)] = warning
         elif warning.kind not in summed:
-            alike = [each for each in warnings if each.kind == warning.kind]
+            alike = [diagnosis_warning for diagnosis_warning in warnings if diagnosis_warning.kind == warning.kind]
             text = message("diagnosis.alike", first=warning.description, times=len(alike))
-            count, to_s = sum(each.count for each in alike), max(each.to_s for each in alike)
+            count, to_s = sum(warning.count for warning in alike), max(warning.to_s for warning in alike)
             summed[warning.kind] = warning.model_copy(update={"description": text, "count": count, "to_s": to_s})
     return list(summed.values())
 

@@ -26,14 +26,14 @@ def check_sensors(baseline: Baseline, recording: Recording) -> tuple[Recording, 
     model = baseline.sensors
     if model is None:
         return recording, []
-    found = find_sensor_deviation(model, recording, lambda onset: wrong_sensor(baseline, recording, onset))
-    if found is None:
+    sensor_deviation = find_sensor_deviation(model, recording, lambda onset: wrong_sensor(baseline, recording, onset))
+    if sensor_deviation is None:
         return recording, []
-    from_s, to_s = float(recording.t[found.onset]), float(recording.t[-1])
-    count = recording.samples - found.onset
-    warning = DiagnosisWarning(kind="sensor", from_s=from_s, to_s=to_s, count=count, description=found.text)
-    if len(found.names) == 1 and found.kind != "noise":
-        y = without_sensor(recording, model.names, found.names[0], found.onset)
+    from_s, to_s = float(recording.t[sensor_deviation.onset]), float(recording.t[-1])
+    count = recording.samples - sensor_deviation.onset
+    warning = DiagnosisWarning(kind="sensor", from_s=from_s, to_s=to_s, count=count, description=sensor_deviation.text)
+    if len(sensor_deviation.names) == 1 and sensor_deviation.kind != "noise":
+        y = without_sensor(recording, model.names, sensor_deviation.names[0], sensor_deviation.onset)
         recording = replace(recording, y=y)
     return recording, [warning]
 
@@ -62,8 +62,8 @@ def _residual_power(baseline: Baseline, rows: Recording, y: np.ndarray[tuple[int
     """Return the mean square of what the healthy plant leaves of u, by one sensor."""
     restart = rows.restart.copy()
     restart[:1] = True
-    found = baseline.pipeline().regression(rows.r, rows.u, y, restart)
-    if found.ok.sum() < MIN_SAMPLES:
+    regression = baseline.pipeline().regression(rows.r, rows.u, y, restart)
+    if regression.ok.sum() < MIN_SAMPLES:
         return 0.0
-    residual = found.eta - found.phi @ np.array(baseline.theta)
-    return float(np.mean(residual[found.ok] ** 2))
+    residual = regression.eta - regression.phi @ np.array(baseline.theta)
+    return float(np.mean(residual[regression.ok] ** 2))

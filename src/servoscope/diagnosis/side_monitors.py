@@ -56,11 +56,11 @@ class SideMonitors:
 
     def check_motion(self) -> None:
         """Let a motion never seen make an alarm harder."""
-        one = self._baseline
-        if one.motion is None and not one.extrapolates:
+        baseline = self._baseline
+        if baseline.motion is None and not baseline.extrapolates:
             raise BaselineError("this baseline does not hold the motion of its recordings: learn it again")
-        if one.limited_motion is not None:
-            self.motion = MotionMonitor(self._pipeline, one.tuning, one.limited_motion)
+        if baseline.limited_motion is not None:
+            self.motion = MotionMonitor(self._pipeline, baseline.tuning, baseline.limited_motion)
 
     def start(self) -> FloatArray:
         """Return the state before the first sample, shape (size,)."""
@@ -122,13 +122,13 @@ class SideLanes:
 
     @cached_property
     def _features(self) -> FeatureLanes | None:
-        features = [one.features for one in self._lanes]
-        return None if all(one is None for one in features) else FeatureLanes(features, self._column)
+        features = [lane.features for lane in self._lanes]
+        return None if all(feature is None for feature in features) else FeatureLanes(features, self._column)
 
     @property
     def size(self) -> int:
         """Numbers of the longest state."""
-        return max(one.size for one in self._lanes)
+        return max(lane.size for lane in self._lanes)
 
     def select(self, assets: npt.NDArray[np.intp]) -> SideLanes:
         """Return those of some assets."""
@@ -136,8 +136,8 @@ class SideLanes:
 
     def start(self, rows: FloatArray) -> None:
         """Write the states before the first sample, shape (assets, ...)."""
-        for row, one in zip(rows, self._lanes, strict=True):
-            row[self._column : self._column + one.size] = one.start()
+        for row, lane in zip(rows, self._lanes, strict=True):
+            row[self._column : self._column + lane.size] = lane.start()
 
     def run(
         self,

@@ -48,10 +48,10 @@ def trace_timeline(
     rate = exam.recording.sample_rate
     likely_healthy = onset.low_s if refined.is_unknown else min(onset.low_s, _time(exam, first + refined.onset.low))
     healthy = int(np.searchsorted(exam.recording.t[first:end], likely_healthy - MARGIN_S))
-    found = find_timeline(window, exam.baseline.plant.all_faults, healthy, refined.best.fitted, progress)
-    if any(one.refit is not None and one.refit.is_unknown for one in found):
+    timeline = find_timeline(window, exam.baseline.plant.all_faults, healthy, refined.best.fitted, progress)
+    if any(stretch.refit is not None and stretch.refit.is_unknown for stretch in timeline):
         return ()
-    return _fault_intervals(exam, found, first, recursive, sure, 3.0 * exam.pipeline.bank.wait / rate)
+    return _fault_intervals(exam, timeline, first, recursive, sure, 3.0 * exam.pipeline.bank.wait / rate)
 
 
 def _fault_intervals(
@@ -63,11 +63,11 @@ def _fault_intervals(
     early_s: float,
 ) -> tuple[FaultInterval, ...]:
     intervals = []
-    for one, following in pairwise([*found, None]):
-        if one is None or one.refit is None:
+    for stretch, following in pairwise([*found, None]):
+        if stretch is None or stretch.refit is None:
             continue
-        candidates = refit_candidates(one.refit)
-        best, onset = candidates[0], _dates(exam, first, one.begin)
+        candidates = refit_candidates(stretch.refit)
+        best, onset = candidates[0], _dates(exam, first, stretch.begin)
         end = None if following is None else _dates(exam, first, following.begin)
         intervals.append(
             FaultInterval(
@@ -79,7 +79,7 @@ def _fault_intervals(
                 probability=best.probability,
                 faults=best.faults if best.probability >= sure and best.name != UNKNOWN else (),
                 candidates=candidates,
-                refit=summarise_refit(one.refit, exam, recursive, first),
+                refit=summarise_refit(stretch.refit, exam, recursive, first),
             )
         )
     return tuple(intervals)

@@ -95,7 +95,7 @@ def verify(told: Diagnosis, baseline: Baseline, recording: Recording) -> Verific
         differences.append(message("verify.other_samples", then=told.samples, now=again.samples))
     if told.verdict != again.verdict:
         differences.append(message("verify.other_verdict", then=told.verdict, now=again.verdict))
-    names = [tuple(fault.name for fault in one.faults) for one in (told, again)]
+    names = [tuple(fault.name for fault in diagnosis.faults) for diagnosis in (told, again)]
     if names[0] != names[1]:
         none = message("verify.no_fault")
         differences.append(message("verify.other_faults", then=names[0] or (none,), now=names[1] or (none,)))

@@ -152,10 +152,10 @@ def _svf_paths(loop: Loop) -> tuple[LinearSystem, LinearSystem, list[LinearSyste
     continuous = state_variable_filter(cutoff, order)
     to_eta = sample_system(continuous, rate, loop.hold, loop.delay).output(plant.input_gain * np.eye(1, order))
     to_phi = sample_system(continuous, rate, "foh").output(np.eye(order)[list(plant.powers)])
-    one = LinearSystem(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1)))
+    system = LinearSystem(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1)))
     smooth = sample_system(continuous, rate, "foh").output(np.eye(1, order))
     wait = settling_samples(cutoff, order, 1.0 / rate) + math.ceil(loop.delay * rate)
-    return to_eta, to_phi, [one if extra == Column.CONSTANT else smooth for extra in plant.extras], wait
+    return to_eta, to_phi, [system if extra == Column.CONSTANT else smooth for extra in plant.extras], wait
 
 
 def _instrument_path(loop: Loop, instrument: InstrumentModel, to_phi: LinearSystem) -> LinearSystem:

@@ -265,21 +265,21 @@ def fit_white_noise(system: LinearSystem, runs: Sequence[FloatArray], stride: in
         model = parts.sum(axis=1)
         return float((np.log(model) + I / model).sum()), ((1.0 / model - I / model**2) @ parts)
 
-    found = minimize(cost, np.full(2, np.log(0.5)), jac=True, method="L-BFGS-B", bounds=[(-25.0, 3.0)] * 2)
-    best = float(found.fun)
+    optimize_result = minimize(cost, np.full(2, np.log(0.5)), jac=True, method="L-BFGS-B", bounds=[(-25.0, 3.0)] * 2)
+    best = float(optimize_result.fun)
 
     def std(x: FloatArray) -> FloatArray:
         return np.asarray(np.sqrt(np.exp(x) * level / size))
 
-    most = np.array(found.x)
+    most = np.array(optimize_result.x)
     for i in (0, 1):
-        low, high = float(found.x[i]), 5.0
+        low, high = float(optimize_result.x[i]), 5.0
         for _ in range(30):
             middle = 0.5 * (low + high)
-            raised = np.where(np.arange(2) == i, middle, found.x)
+            raised = np.where(np.arange(2) == i, middle, optimize_result.x)
             low, high = (middle, high) if cost(raised)[0] < best + LIKELIHOOD_DROP else (low, middle)
         most[i] = high
-    likely, loudest = std(found.x), std(most)
+    likely, loudest = std(optimize_result.x), std(most)
     return WhiteNoiseFit(
         WhiteNoise(float(likely[0]), float(likely[1])),
         WhiteNoise(float(loudest[0]), float(loudest[1])),

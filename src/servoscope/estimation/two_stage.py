@@ -263,7 +263,7 @@ def compile_stage_one(estimator: str, pattern: sparse_lti.SparsityPattern) -> Ca
         with p.when(waiting > 0.0):
             head.store(WAIT, (waiting - 1.0).text)
         with p.when(waiting <= 0.0):
-            wide = [each.regrouped(VECTOR_WIDTH) for each in (phi, theta, K, sums)]
+            wide = [memory.regrouped(VECTOR_WIDTH) for memory in (phi, theta, K, sums)]
             if steady:
                 apply(multiply, P_d.regrouped(VECTOR_WIDTH), phi.regrouped(VECTOR_WIDTH, shared=True), wide[2])
             apply(products, *wide)

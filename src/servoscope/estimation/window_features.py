@@ -156,13 +156,15 @@ class WindowLanes:
     def __init__(self, assets: Sequence[WindowFeatures | None], begins: IntArray) -> None:
         """`begins`: where in its row the state of each asset begins, shape (assets,); None: it has no windows."""
         self._assets, self._begins = tuple(assets), begins
-        known = [one for one in assets if one is not None]
-        self._table = np.zeros((len(assets), max(one.constants.size for one in known)))
-        for row, one in zip(self._table, assets, strict=True):
-            if one is not None:
-                row[: one.constants.size] = one.constants
-        self._shortest = min(one.layout.window for one in known)
-        self._levels, self._sums = (max(getattr(one.layout, name) for one in known) for name in ("levels", "sums"))
+        known = [asset for asset in assets if asset is not None]
+        self._table = np.zeros((len(assets), max(features.constants.size for features in known)))
+        for row, asset in zip(self._table, assets, strict=True):
+            if asset is not None:
+                row[: asset.constants.size] = asset.constants
+        self._shortest = min(features.layout.window for features in known)
+        self._levels, self._sums = (
+            max(getattr(features.layout, name) for features in known) for name in ("levels", "sums")
+        )
 
     def run(
         self, rows: FloatArray, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray

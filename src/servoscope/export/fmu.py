@@ -148,9 +148,9 @@ def _model_description(baseline: Baseline, made: CMonitor, name: str) -> Xml.Ele
     _describe_variables(variables, (y_unit, u_unit), baseline.thresholds.statistic, outputs)
     structure = Xml.SubElement(root, "ModelStructure")
     for kind, attribute, known in (("Output", "causality", "output"), ("InitialUnknown", "initial", "calculated")):
-        for each in variables:
-            if each.get(attribute) == known:
-                Xml.SubElement(structure, kind, valueReference=each.get("valueReference", ""))
+        for variable in variables:
+            if variable.get(attribute) == known:
+                Xml.SubElement(structure, kind, valueReference=variable.get("valueReference", ""))
     return root
 
 

@@ -24,8 +24,8 @@ MARK_BYTES, CRC_BYTES = 8, 4
 def fingerprint(structure: str, *numbers: FloatArray | tuple[float, ...]) -> bytes:
     """Return what tells one exported monitor from another, 8 bytes."""
     digest = hashlib.sha256(structure.encode())
-    for each in numbers:
-        digest.update(np.asarray(each, dtype="<f8").tobytes())
+    for number in numbers:
+        digest.update(np.asarray(number, dtype="<f8").tobytes())
     return digest.digest()[:MARK_BYTES]
 
 

@@ -37,7 +37,9 @@ class Baselines:
         by_name = {"": source} if isinstance(source, Baseline) else source
         if not by_name:
             raise BaselineError("no baselines: give at least one")
-        return cls({name: one.model_dump_json(by_alias=True) for name, one in by_name.items()}, assets, window_s)
+        return cls(
+            {name: baseline.model_dump_json(by_alias=True) for name, baseline in by_name.items()}, assets, window_s
+        )
 
     def day_monitor(self, name: str) -> DayMonitor:
         """Return the monitor for an asset or group.

@@ -151,7 +151,7 @@ def _evaluate_group(
     if not names:
         return -np.inf, Cause(key, group, tuple(assets), (0.0,) * len(assets), 0.0, "", 0.0, 1.0, (1.0, 1.0))
     arrays = [_evidence_arrays(evidence[i]) for i in alike]
-    each = [_member_log_likelihoods(*one, prior) for one in arrays]
+    each = [_member_log_likelihoods(*array, prior) for array in arrays]
     together = np.sum([np.logaddexp(*both) for both in each], axis=0)  # log-likelihood of (f, s), shape (m, sizes)
     posterior = together + _log_prior(prior.size)
     by_parameter = _log_sum(posterior)

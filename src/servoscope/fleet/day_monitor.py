@@ -249,4 +249,4 @@ def _follow(steps: Sequence[DayStep], ordered: Sequence[_RowOrder]) -> list[tupl
 @lru_cache(maxsize=256)
 def _join_monitors(monitors: tuple[DayMonitor, ...]) -> Monitor:
     """Return the fleet of some monitors."""
-    return Monitor.join([each.monitor for each in monitors])
+    return Monitor.join([monitor.monitor for monitor in monitors])

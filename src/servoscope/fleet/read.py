@@ -71,7 +71,7 @@ class _RowGroup(NamedTuple):
             table = self.source.read_row_group(self.group, columns=self.names, use_threads=False)
         except (pa.ArrowException, OSError) as error:
             raise _damaged_file_error(self.file, error) from None
-        return rows_from_table(Table(name, {each: table.column(each) for each in self.names}), columns)
+        return rows_from_table(Table(name, {name: table.column(name) for name in self.names}), columns)
 
 
 def _list_row_groups(file: str, columns: Columns) -> Iterator[_RowGroup]:

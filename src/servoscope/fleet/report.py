@@ -57,10 +57,10 @@ def render_fleet_page(fleet: Fleet, lake: str) -> str:
             for cause, since in zip(fleet.causes, fleet.since, strict=True)
             if cause.probability >= MIN_PROBABILITY_SHOWN
         ],
-        ill=[one for one in fleet.assets if one.state not in ("healthy", FAILED)],
-        changed=[one for one in fleet.assets if one.before is not None and one.before != one.state],
+        ill=[asset for asset in fleet.assets if asset.state not in ("healthy", FAILED)],
+        changed=[asset for asset in fleet.assets if asset.before is not None and asset.before != asset.state],
         days=sorted({day for some in fleet.states.values() for day in some})[-MAX_DAYS:],
-        shown=[one.asset for one in fleet.assets][:MAX_TABLE_ROWS],
+        shown=[asset.asset for asset in fleet.assets][:MAX_TABLE_ROWS],
         late=[(asset, format_count(rows)) for asset, rows in late],
         most=MAX_TABLE_ROWS,
         tones=TONES,

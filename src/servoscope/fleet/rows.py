@@ -151,7 +151,7 @@ def signals_from_table(table: Table, columns: Columns) -> tuple[FloatArray, Floa
         _mix(table, parse_combination(getattr(columns, key), known, f"{where} {key}"), key)
         for key in ("reference", "input")
     )
-    sensors = [_mix(table, one, "output") for one in parse_output(columns, known, f"{where} output")]
+    sensors = [_mix(table, combination, "output") for combination in parse_output(columns, known, f"{where} output")]
     return r, u, sensors[0] if len(sensors) == 1 else np.asarray(np.mean(sensors, axis=0))
 
 

@@ -104,7 +104,7 @@ class StreamShard:
 
     def save(self) -> None:
         """Save the states, and set the timer: for the first row that waits, or the end of a day that is open."""
-        times = [each.due_us for each in self._states.values()]
+        times = [state.due_us for state in self._states.values()]
         due = min((time for time in times if time is not None), default=None)
         if due is not None:
             self._handle.registerTimer(due // 1000 + 1)

@@ -83,7 +83,7 @@ class Fleet:
 
     def count(self, state: str) -> int:
         """Return how many assets are in a state."""
-        return sum(one.state == state for one in self.assets)
+        return sum(asset.state == state for asset in self.assets)
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain values."""

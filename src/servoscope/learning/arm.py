@@ -68,19 +68,19 @@ def learn_arm(loop: ArmLoop, urdf: str, recordings: Sequence[ArmRecording]) -> A
     model = ArmModel(loop.kinematics(urdf, loop.urdf), loop)
     signals = [filter_arm_log(recording, model) for recording in recordings]
     _check_motion(model, signals)
-    temperature = np.mean([each.temperature.mean(0) for each in signals], axis=0)
+    temperature = np.mean([signal.temperature.mean(0) for signal in signals], axis=0)
     p = len(model.base.names)
     theta = np.zeros(len(coefficient_names(model)))
     theta[:p] = model.base.nominal
     for _ in range(2):  # friction by load needs the load, which the first fit gives
-        designs = [complete_columns(model, each, theta, temperature) for each in signals]
+        designs = [complete_columns(model, signal, theta, temperature) for signal in signals]
         fit = _fit(model, signals, designs)
         theta = fit.theta
     information = fit.A.sum(0) + fit.prior
     std = np.sqrt(np.diag(np.linalg.inv(information)))
     _check_signs(model, theta, std, recordings[0].name)
 
-    torque = np.sqrt(np.mean([np.square(each.tau).mean(1) for each in signals], axis=0))
+    torque = np.sqrt(np.mean([np.square(signal.tau).mean(1) for signal in signals], axis=0))
     scale = deviation_scales(model, theta, torque)
     # each recording by the coefficients of the others
     several = len(signals) >= MIN_RECORDINGS
@@ -91,22 +91,22 @@ def learn_arm(loop: ArmLoop, urdf: str, recordings: Sequence[ArmRecording]) -> A
         for i in range(len(signals))
     ]
     residuals = [
-        each.tau - np.einsum("jpm,p->jm", X, own) for each, X, own in zip(signals, designs, thetas, strict=True)
+        signal.tau - np.einsum("jpm,p->jm", X, own) for signal, X, own in zip(signals, designs, thetas, strict=True)
     ]
     columns = [
-        np.concatenate([X, deviation_columns(model, each, X, theta)], axis=1)
-        for each, X in zip(signals, designs, strict=True)
+        np.concatenate([X, deviation_columns(model, signal, X, theta)], axis=1)
+        for signal, X in zip(signals, designs, strict=True)
     ]
     inflation = _inflation(signals, columns, residuals, fit.noise, len(theta))
     weight = fit.noise * np.sqrt(inflation)
     whole = [
-        block_information(each.t, *weighted(each, X, e, weight))
-        for each, X, e in zip(signals, columns, residuals, strict=True)
+        block_information(signal.t, *weighted(signal, X, e, weight))
+        for signal, X, e in zip(signals, columns, residuals, strict=True)
     ]
     moves = slice(len(theta), None)
-    found = [(each.A.sum(0)[moves, moves], each.g.sum(0)[moves]) for each in whole]
+    found = [(information.A.sum(0)[moves, moves], information.g.sum(0)[moves]) for information in whole]
     between = random_effect(found, scale, BETWEEN_SHARE)
-    halves = [second_half(each.part(moves), np.diag(between**-2.0)) for each in whole]
+    halves = [second_half(information.part(moves), np.diag(between**-2.0)) for information in whole]
     drift = random_effect(halves, scale, DRIFT_SHARE)
     information /= np.median(inflation)
     notes = list(_mounting_notes(model, signals, designs, fit, recordings[0].name))
@@ -133,8 +133,8 @@ def learn_arm(loop: ArmLoop, urdf: str, recordings: Sequence[ArmRecording]) -> A
         notes.append(message("arm.few_recordings", least=MIN_RECORDINGS))
     events = np.max(
         [
-            largest_events(each, X, e, fit.noise, model, theta)
-            for each, X, e in zip(signals, designs, residuals, strict=True)
+            largest_events(signal, X, e, fit.noise, model, theta)
+            for signal, X, e in zip(signals, designs, residuals, strict=True)
         ],
         axis=0,
     )
@@ -142,7 +142,8 @@ def learn_arm(loop: ArmLoop, urdf: str, recordings: Sequence[ArmRecording]) -> A
         loop=loop.model_dump(mode="json", exclude_defaults=True) | {"kind": "arm"},
         urdf=urdf,
         sources=tuple(
-            BaselineSource(name=each.name, samples=each.rows, duration_s=each.duration_s) for each in recordings
+            BaselineSource(name=recording.name, samples=recording.rows, duration_s=recording.duration_s)
+            for recording in recordings
         ),
         names=coefficient_names(model),
         theta=to_tuples(theta),
@@ -187,15 +188,15 @@ def _fit(model: ArmModel, signals: Sequence[ArmSignals], designs: Sequence[Float
     prior[rest, rest] = MAX_COEFFICIENT**-2.0
     load = len(model.names) + np.arange(model.arm.size)
     prior[load, load] = (MAX_LOAD_FRICTION if model.loop.load_friction else NO_LOAD_FRICTION) ** -2.0
-    moving = np.concatenate([each.moving for each in signals], axis=1)
-    tau = np.concatenate([each.tau for each in signals], axis=1)
+    moving = np.concatenate([signal.moving for signal in signals], axis=1)
+    tau = np.concatenate([signal.tau for signal in signals], axis=1)
     noise = np.sqrt((np.square(tau) * moving).sum(1) / moving.sum(1))
     for _ in range(FIT_STEPS):
         pieces = [
-            block_information(each.t, *weighted(each, X, each.tau, noise), np.inf)
-            for each, X in zip(signals, designs, strict=True)
+            block_information(signal.t, *weighted(signal, X, signal.tau, noise), np.inf)
+            for signal, X in zip(signals, designs, strict=True)
         ]
-        A, b = np.array([each.A[0] for each in pieces]), np.array([each.g[0] for each in pieces])
+        A, b = np.array([piece.A[0] for piece in pieces]), np.array([piece.g[0] for piece in pieces])
         theta = np.linalg.solve(A.sum(0) + prior, b.sum(0) + prior @ start)
         left = tau - np.concatenate([np.einsum("jpm,p->jm", X, theta) for X in designs], axis=1)
         noise = np.sqrt((np.square(left) * moving).sum(1) / moving.sum(1))
@@ -204,7 +205,7 @@ def _fit(model: ArmModel, signals: Sequence[ArmSignals], designs: Sequence[Float
 
 def _check_motion(model: ArmModel, signals: Sequence[ArmSignals]) -> None:
     period = float(np.median(np.diff(signals[0].t)))
-    moved = np.sum([each.moving.sum(1) for each in signals], axis=0) * period
+    moved = np.sum([signal.moving.sum(1) for signal in signals], axis=0) * period
     for name, seconds in zip(model.arm.names, moved, strict=True):
         if seconds < MIN_MOVING_S:
             raise NotEnoughError(
@@ -243,9 +244,9 @@ def _inflation(
     for j in range(noise.size):
         A: FloatArray | float = 0.0
         G: FloatArray | float = 0.0
-        for each, X, e in zip(signals, columns, residuals, strict=True):
-            Xw, ew = weighted(each, X[:, first:], e, noise)
-            blocks = block_information(each.t, Xw[j : j + 1], ew[j : j + 1], INFLATION_BLOCK_S)
+        for signal, X, e in zip(signals, columns, residuals, strict=True):
+            Xw, ew = weighted(signal, X[:, first:], e, noise)
+            blocks = block_information(signal.t, Xw[j : j + 1], ew[j : j + 1], INFLATION_BLOCK_S)
             A, G = A + blocks.A.sum(0), G + blocks.g.T @ blocks.g
         values, vectors = np.linalg.eigh(np.asarray(A) / (size := np.sqrt(np.diag(A)) + 1e-300) / size[:, None])
         kept = values > 1e-6 * values[-1]
@@ -278,9 +279,9 @@ def _mounting_notes(
         turned = ArmModel(model.arm, model.loop.model_copy(update={"gravity": tuple((size * direction).tolist())}))
         # only the links' nominal parameters: with all free, any mounting explains much
         total = np.zeros(n)
-        for each, X in zip(signals, designs, strict=True):
-            rigid = turned.inertial_torque(each.q, each.v, each.a, turned.base.nominal)
-            left_over = each.tau - rigid
+        for signal, X in zip(signals, designs, strict=True):
+            rigid = turned.inertial_torque(signal.q, signal.v, signal.a, turned.base.nominal)
+            left_over = signal.tau - rigid
             own = np.concatenate([X[:, p:]], axis=1)
             flat = own.transpose(0, 2, 1)
             for j in range(n):

@@ -74,15 +74,15 @@ class AxisRegression:
 
 def rest_speed(signals: Sequence[AxisSignals]) -> float:
     """Return the speed below which an axis counts as resting."""
-    speed = np.concatenate([one.speed for one in signals])
+    speed = np.concatenate([signal.speed for signal in signals])
     return REST_SHARE * float(np.sqrt(np.mean(speed**2)))
 
 
 def check_motion(recordings: Sequence[Recording], signals: Sequence[AxisSignals], slow: float, columns: int) -> None:
     """Raise NotEnoughError where a recording moves too little for some columns of a regression."""
     fewest = MIN_SAMPLES_PER_COLUMN * columns
-    for recording, one in zip(recordings, signals, strict=True):
-        if (usable := int(one.moving(slow, 0).sum())) < fewest:
+    for recording, signal in zip(recordings, signals, strict=True):
+        if (usable := int(signal.moving(slow, 0).sum())) < fewest:
             raise NotEnoughError(
                 f"{recording.name}: it moves in {usable} samples only, of at least {fewest}: leave it out, or record a "
                 "motion with more excitation"
@@ -98,8 +98,8 @@ def fit_axis_noise(problems: Sequence[AxisRegression], slow: float) -> AxisNoise
     from scipy.signal import savgol_filter
 
     rate = problems[0].signals.sample_rate
-    accelerations = [np.gradient(one.signals.speed, 1.0 / rate) for one in problems]
-    rough = np.concatenate([one.signals.y - savgol_filter(one.signals.y, 5, 2) for one in problems])
+    accelerations = [np.gradient(problem.signals.speed, 1.0 / rate) for problem in problems]
+    rough = np.concatenate([problem.signals.y - savgol_filter(problem.signals.y, 5, 2) for problem in problems])
     size = float(np.sqrt(np.mean(np.concatenate(accelerations) ** 2)))
     start = np.log([0.2 * size, 1.0 / rate, max(float(rough.std()), 1e-12 * size)])
     bounds = [
@@ -113,8 +113,8 @@ def fit_axis_noise(problems: Sequence[AxisRegression], slow: float) -> AxisNoise
     def cost(x: FloatArray) -> float:
         nonlocal first
         total, count = 0.0, 0
-        for one in problems:
-            X, e, filter = one.regress(AxisNoise(*np.exp(x).tolist()), slow)
+        for problem in problems:
+            X, e, filter = problem.regress(AxisNoise(*np.exp(x).tolist()), slow)
             left = e - X @ np.linalg.lstsq(X, e, rcond=None)[0]
             total += len(e) * float(np.log(filter.variance)) + float(left @ left)
             count += len(e)
@@ -124,14 +124,14 @@ def fit_axis_noise(problems: Sequence[AxisRegression], slow: float) -> AxisNoise
 
     # a simplex of its own size: SciPy's is a share of the logarithms, and so depends on the unit of y
     simplex = np.vstack([start, start + FIRST_STEP * np.eye(len(start))])
-    found = minimize(
+    optimize_result = minimize(
         cost,
         start,
         method="Nelder-Mead",
         bounds=bounds,
         options={"maxiter": STEPS, "xatol": 0.02, "fatol": 0.5, "initial_simplex": simplex},
     )
-    return AxisNoise(*np.exp(found.x).tolist())
+    return AxisNoise(*np.exp(optimize_result.x).tolist())
 
 
 def _fit_drive_and_noise(
@@ -142,7 +142,9 @@ def _fit_drive_and_noise(
     assert isinstance(plant, AxisPlant)
 
     def regressions(drive: DriveLag) -> list[AxisRegression]:
-        return [AxisRegression.of(plant, axis_signals(loop, one, stride, drive, moves)) for one in recordings]
+        return [
+            AxisRegression.of(plant, axis_signals(loop, recording, stride, drive, moves)) for recording in recordings
+        ]
 
     noise = fit_axis_noise(regressions(drive), slow)
     for _ in range(MAX_DRIVE_ROUNDS):
@@ -192,9 +194,13 @@ def fit_drive(
     grid = [np.array([delay, lag]) for delay in DELAYS_S for lag in LAGS_S]
     start = min([np.array(known), *grid], key=cost)
     simplex = start + 0.5 * max(np.diff(DELAYS_S)) * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    found = minimize(cost, start, method="Nelder-Mead", options={"xatol": 0.02 / rate, "initial_simplex": simplex})
-    late = DriveLag(*np.abs(found.x).tolist())
-    matters = cost(np.array(known)) - float(found.fun) > MIN_DRIVE_GAIN and sum(late) > max(MIN_DRIVE_S, 1.0 / rate)
+    optimize_result = minimize(
+        cost, start, method="Nelder-Mead", options={"xatol": 0.02 / rate, "initial_simplex": simplex}
+    )
+    late = DriveLag(*np.abs(optimize_result.x).tolist())
+    matters = cost(np.array(known)) - float(optimize_result.fun) > MIN_DRIVE_GAIN and sum(late) > max(
+        MIN_DRIVE_S, 1.0 / rate
+    )
     return late if matters else known
 
 
@@ -221,19 +227,19 @@ def fit_axis(
     """
     plant, stride = loop.plant, axis_stride(loop.sample_rate)
     assert isinstance(plant, AxisPlant)
-    signals = [axis_signals(loop, one, stride) for one in recordings]
+    signals = [axis_signals(loop, recording, stride) for recording in recordings]
     slow = rest_speed(signals)
     check_motion(recordings, signals, slow, 1 + len(plant.acting))
     drive, noise, problems = _fit_drive_and_noise(loop, recordings, stride, slow, moves)
-    fits = [fit_recording(one, noise, slow) for one in problems]
+    fits = [fit_recording(problem, noise, slow) for problem in problems]
     names = ("inertia", *(column.coefficient for column in plant.acting))
     center, of_center = combine_fits(fits, len(names))
     # in physical units, linear around the common coefficients: u alone may hardly show in a recording
     J = _physical_slope(center, plant)
     mean = _physical(center, plant)
-    values = np.array([mean + J @ (one.coefficients[: len(names)] - center) for one in fits])
-    covariances = np.array([J @ one.covariance[: len(names), : len(names)] @ J.T for one in fits])
-    stds = np.sqrt(np.array([np.diag(one) for one in covariances]))
+    values = np.array([mean + J @ (fit.coefficients[: len(names)] - center) for fit in fits])
+    covariances = np.array([J @ fit.covariance[: len(names), : len(names)] @ J.T for fit in fits])
+    stds = np.sqrt(np.array([np.diag(covariance) for covariance in covariances]))
     known = [
         i for i, name in enumerate(names) if name == "inertia" or not plant.acting[i - 1].signed or name == "gravity"
     ]
@@ -249,7 +255,7 @@ def fit_axis(
     covariance = (J @ of_center @ J.T)[np.ix_(known, known)] / np.outer(mean[known], mean[known])
     covariance = covariance + np.diag(relative_scatter(values[:, known], stds[:, known], mean[known]) ** 2)
     coefficients = dict(zip(names, mean.tolist(), strict=True))
-    force = abs(plant.input_gain) * float(np.sqrt(np.mean(np.concatenate([one.u for one in signals]) ** 2)))
+    force = abs(plant.input_gain) * float(np.sqrt(np.mean(np.concatenate([signal.u for signal in signals]) ** 2)))
     model = AxisModel(
         coefficients=coefficients,
         parameters=tuple(names[i] for i in known),
@@ -295,8 +301,8 @@ def combine_fits(fits: Sequence[AxisFit], n: int) -> tuple[FloatArray, FloatArra
     them: what only one recording shows is taken from that one, and none counts for more than recordings agree (random
     effects of several coefficients: Jackson, Riley and White, 2011).
     """
-    values = np.array([one.coefficients[:n] for one in fits])
-    covariances = np.array([one.covariance[:n, :n] for one in fits])
+    values = np.array([fit.coefficients[:n] for fit in fits])
+    covariances = np.array([fit.covariance[:n, :n] for fit in fits])
     stds = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     center, scatter = np.zeros(n), np.full(n, SCATTER)
     for step in range(MAX_SCATTER_ROUNDS):

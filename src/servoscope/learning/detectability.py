@@ -92,7 +92,7 @@ def forecast_changes(baseline: Baseline, more: int) -> dict[str, tuple[float, fl
 
 def _smallest_change(changes: Sequence[DetectableChange]) -> tuple[float, str]:
     """Return the smallest change that can be detected, infinite where there is none, and the name of its fault."""
-    return min(((one.change or np.inf, one.name) for one in changes), default=(0.0, ""))
+    return min(((change.change or np.inf, change.name) for change in changes), default=(0.0, ""))
 
 
 def baseline_misfit(
@@ -103,7 +103,7 @@ def baseline_misfit(
 
     learned = [e.updates > 0 for e in estimates]
     S = np.concatenate([e.S[ok] for e, ok in zip(estimates, learned, strict=True)])
-    d = np.concatenate([each[ok] for each, ok in zip(deviations, learned, strict=True)])
+    d = np.concatenate([deviation[ok] for deviation, ok in zip(deviations, learned, strict=True)])
     if not len(d):
         return 0.0, 0.0
     unit = np.diag((fit.rms_eta / fit.tuning.scale) ** 2)

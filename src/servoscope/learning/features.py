@@ -47,14 +47,14 @@ def learn_features(loop: Loop, recordings: Sequence[Recording]) -> tuple[Feature
         return None, []
     layout = choose_layout(loop, recordings)
     runner = WindowFeatures(layout)
-    windows = [_windows(runner, one) for one in recordings]
+    windows = [_windows(runner, recording) for recording in recordings]
     if not all(windows):
         return None, [message("learning.features_short", window_s=layout.window / layout.sample_rate)]
     names = tuple(loop.columns.covariates)
-    conditions = np.array([[np.nanmean(one.channels[name]) for name in names] for one in recordings])
+    conditions = np.array([[np.nanmean(recording.channels[name]) for name in names] for recording in recordings])
     spans = [
-        [span._replace(covariates=own) for span in _spans(each, layout)]
-        for each, own in zip(windows, conditions, strict=True)
+        [span._replace(covariates=own) for span in _spans(window, layout)]
+        for window, own in zip(windows, conditions, strict=True)
     ]
     low, high = _motion_range(spans)
     conditions_of = to_tuples(conditions) if names else ()
@@ -68,9 +68,9 @@ def learn_features(loop: Loop, recordings: Sequence[Recording]) -> tuple[Feature
         )
         statistics = [GroupStatistic.of(group) for group in groups]
         scores = [
-            (one.group.past, one.score(*one.group.pick(span), span.covariates))
+            (statistic.group.past, statistic.score(*statistic.group.pick(span), span.covariates))
             for span in own_spans
-            for one in statistics
+            for statistic in statistics
         ]
         left_out.append(max(score for past, score in scores if not past))
         past_left_out += [max(score for past, score in scores if past)] if any(past for past, _ in scores) else []
@@ -93,26 +93,26 @@ def learn_features(loop: Loop, recordings: Sequence[Recording]) -> tuple[Feature
 
 def _windows(runner: WindowFeatures, recording: Recording) -> list[Window]:
     """Return the windows of a recording, of a long one those of its beginning: more say nothing new of its mean."""
-    state, found = runner.start(), list[Window]()
+    state, windows = runner.start(), list[Window]()
     for rows in outofcore.iter_chunks(0, recording.samples):
         part = recording.rows(rows)
-        found += runner.run(state, part.r, part.u, part.y, part.restart)
+        windows += runner.run(state, part.r, part.u, part.y, part.restart)
         outofcore.release(*recording.columns)
-        if len(found) >= MAX_WINDOWS:
+        if len(windows) >= MAX_WINDOWS:
             break
-    return found
+    return windows
 
 
 def _spans(windows: Sequence[Window], layout: FeatureLayout) -> list[SpanFeatures]:
     """Return the spans of a recording; the last one if it is at least half as long as the others."""
     numbers = sorted({window.span for window in windows})
     members = [[window for window in windows if window.span == number] for number in numbers]
-    found = [SpanFeatures.of(each, layout, past=True) for each in members]
-    return [span for span in found if 2.0 * span.counts[0] >= layout.span] or found[:1]
+    features = [SpanFeatures.of(member, layout, past=True) for member in members]
+    return [span for span in features if 2.0 * span.counts[0] >= layout.span] or features[:1]
 
 
 def _motion_range(spans: Sequence[Sequence[SpanFeatures]]) -> tuple[FloatArray, FloatArray]:
-    seen = np.array([span.motion for each in spans for span in each])
+    seen = np.array([span.motion for span_features in spans for span in span_features])
     seen = np.where(np.isfinite(seen), seen, np.nanmean(np.where(np.isfinite(seen), seen, 0.0), axis=0))
     low, high = seen.min(axis=0), seen.max(axis=0)
     wider = WIDENING_SHARE * (high - low) + MIN_WIDENING
@@ -131,7 +131,7 @@ def choose_layout(loop: Loop, recordings: Sequence[Recording]) -> FeatureLayout:
     counts = [recording.samples // window for recording in recordings]
     whole = float(np.median(counts))
     first = 1 if whole >= 3.0 else 0  # start-up is unlike what follows, where anything follows
-    speed = np.concatenate([np.abs(_speed(one)) for one in recordings])
+    speed = np.concatenate([np.abs(_speed(recording)) for recording in recordings])
     powers = [
         float(np.mean([np.var(x) for x in each])) for each in zip(*((r.u, r.r - r.y) for r in recordings), strict=True)
     ]
@@ -162,7 +162,7 @@ def _speed(recording: Recording) -> FloatArray:
 
 def _period(recordings: Sequence[Recording]) -> int:
     """Return the period of the reference that all recordings share [samples]; 0 where there is none."""
-    found = {_period_of(one) for one in recordings}
+    found = {_period_of(recording) for recording in recordings}
     return found.pop() if len(found) == 1 else 0
 
 

@@ -125,12 +125,12 @@ def _likeliest_parameters(
     Nothing of what y does between the samples, which the recursion's residual takes for noise, is left out. None where
     the innovations are not white, and with covariates, which are taken out of the regressions, not of the recordings.
     """
-    found = None if healthy.covariates is not None else fit_innovations(healthy.loop, healthy.recordings, noise)
-    if found is None or not found.explains:
+    fit = None if healthy.covariates is not None else fit_innovations(healthy.loop, healthy.recordings, noise)
+    if fit is None or not fit.explains:
         return None, noise, []
-    wrong_file = len(found.names) > len(healthy.loop.plant.parameters)
+    wrong_file = len(fit.names) > len(healthy.loop.plant.parameters)
     notes = [message("learning.wrong_file", share=FILE_ERROR)] if wrong_file else []
-    return (found.names, found.x, found.covariance), found.noise, notes
+    return (fit.names, fit.x, fit.covariance), fit.noise, notes
 
 
 def _describe(

@@ -94,17 +94,17 @@ class Population:
                     f"{name}: its coefficients ({', '.join(other.names)}; plant {other.loop.plant.kind}) are not those "
                     f"of {first_name} ({', '.join(first.names)}; plant {first.loop.plant.kind}): no like machine"
                 )
-        each = list(baselines.values())
-        scatter, degrees = _common_scatter(each, len(first.names))
-        theta = np.array([one.theta for one in each])
-        errors = np.array([_estimation_error(one, scatter) for one in each])
+        baseline = list(baselines.values())
+        scatter, degrees = _common_scatter(baseline, len(first.names))
+        theta = np.array([baseline.theta for baseline in baseline])
+        errors = np.array([_estimation_error(baseline, scatter) for baseline in baseline])
         return cls(
-            len(each),
+            len(baseline),
             NormalPrior.from_machines(first.names, theta, errors),
-            _ratios(each),
+            _ratios(baseline),
             scatter,
             degrees,
-            2 * sum(bool(one.thresholds.hypotheses) for one in each) > len(each),
+            2 * sum(bool(baseline.thresholds.hypotheses) for baseline in baseline) > len(baseline),
         )
 
     def pooled_scatter(self, own: FloatArray, recordings: int) -> FloatArray:
@@ -159,13 +159,13 @@ def _common_scatter(each: Sequence[Baseline], n: int) -> tuple[FloatArray, float
     machines with a coefficient of variation c come from an inverse gamma law of 4 + 2/c^2 degrees (by moments). The
     correlations between coefficients are shrunk towards none (oracle approximating shrinkage).
     """
-    known = [one for one in each if one.scatter.between]
+    known = [baseline for baseline in each if baseline.scatter.between]
     if len(known) < MIN_MACHINES:
         return np.zeros((n, n)), 0.0
-    degrees = np.array([len(one.sources) - 1.0 for one in known])
-    covariances = np.array([one.scatter.between for one in known])
+    degrees = np.array([len(baseline.sources) - 1.0 for baseline in known])
+    covariances = np.array([baseline.scatter.between for baseline in known])
     S = np.einsum("k,kij->ij", degrees, covariances) / degrees.sum()
-    least = FLOOR * np.mean([np.diag(one.covariance_array()) for one in known], axis=0)
+    least = FLOOR * np.mean([np.diag(baseline.covariance_array()) for baseline in known], axis=0)
     variances = np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0)
     seen = np.diag(S) > least
     chance = 2.0 / degrees.mean()
@@ -196,8 +196,8 @@ def _estimation_error(baseline: Baseline, scatter: FloatArray) -> FloatArray:
 def _ratios(each: Sequence[Baseline]) -> NormalPrior | None:
     names = tuple(each[0].healthy.ratios)
     if not names or any(
-        tuple(one.healthy.ratios) != names or len(one.healthy.covariance) != len(names) for one in each
+        tuple(baseline.healthy.ratios) != names or len(baseline.healthy.covariance) != len(names) for baseline in each
     ):
         return None
-    values = np.log([[one.healthy.ratios[name] for name in names] for one in each])
-    return NormalPrior.from_machines(names, values, np.array([one.healthy.covariance for one in each]))
+    values = np.log([[baseline.healthy.ratios[name] for name in names] for baseline in each])
+    return NormalPrior.from_machines(names, values, np.array([baseline.healthy.covariance for baseline in each]))

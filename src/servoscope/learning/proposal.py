@@ -146,21 +146,21 @@ def propose_loop(paths: Sequence[Path], columns: Columns, where: Mapping[str, st
     is_speed = names_speed(columns.outputs[0])
     try:
         recording = read(path, columns=columns, where=where)
-        found = _inspect(recording, is_speed)
-        irregular = found.sampling.jitter_percent > JITTER_PERCENT
+        inspection = _inspect(recording, is_speed)
+        irregular = inspection.sampling.jitter_percent > JITTER_PERCENT
     except IrregularTimeError:
         irregular = True
     if irregular:
         columns = columns.model_copy(update={"resample": True})
         recording = read(path, columns=columns, where=where)
-        found = _inspect(recording, is_speed)
-    if found.best_order is None or found.suggested_cutoff_hz is None:
-        raise RecordingError(f"{path}: {found.summary}")
+        inspection = _inspect(recording, is_speed)
+    if inspection.best_order is None or inspection.suggested_cutoff_hz is None:
+        raise RecordingError(f"{path}: {inspection.summary}")
     rate = float(f"{recording.sample_rate:.6g}")
     # the largest of two digits that the recommendation allows
     resampled = next((defect.text.values["cutoff"] for defect in recording.defects if defect.kind == "resampled"), None)
     cutoff = number_format.round_down(
-        min(found.suggested_cutoff_hz, resampled if isinstance(resampled, float) else math.inf)
+        min(inspection.suggested_cutoff_hz, resampled if isinstance(resampled, float) else math.inf)
     )
     memory = max(MIN_PERIODS / cutoff, min(MAX_MEMORY_S, recording.duration_s / MEMORIES))
     memory = number_format.round_down(memory)
@@ -177,9 +177,9 @@ def propose_loop(paths: Sequence[Path], columns: Columns, where: Mapping[str, st
             recordings.append(read(other, loop_of({"kind": "polynomial", "order": 2}), where=where))
         except ServoscopeError as error:
             notes.append(message("init.left_out", reason=str(error)))
-    assert found.rest is not None, "what has an order has moved"
+    assert inspection.rest is not None, "what has an order has moved"
     try:
-        candidates = choose_plant(recordings, cutoff, is_speed, found.rest.speed)
+        candidates = choose_plant(recordings, cutoff, is_speed, inspection.rest.speed)
     except NotEnoughError as error:
         raise RecordingError(f"{path}: {error}") from None
     chosen = candidates[0]
@@ -326,10 +326,10 @@ def _unwrapped_columns(
             plain[key] = combination
     if len(columns.outputs) > 1:
         plain.pop("output", None)
-    values = _column_values(opened, [name for each in plain.values() for name in each.factors], where)
+    values = _column_values(opened, [name for combination in plain.values() for name in combination.factors], where)
     changes, wraps = {}, {}
-    for key, each in plain.items():
-        ((name, factor),) = each.factors.items()
+    for key, linear_combination in plain.items():
+        ((name, factor),) = linear_combination.factors.items()
         if (period := find_wrap(values[name])) is not None:
             text = f"{quoted_channel(name)} % {period:.16g}"
             changes[key] = text if factor == 1.0 else f"{factor:.15g} * ({text})"

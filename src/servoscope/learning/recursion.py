@@ -129,10 +129,10 @@ def _tune(
         note = message("learning.weak_instrument", strength=fit.strength, least=MIN_INSTRUMENT_EIGENVALUE)
         return *tune_pipeline(plain, recordings), [note]
     pipeline, regressions, fit = tune_pipeline(plain, recordings)
-    found, notes = learn_instrument(pipeline, recordings, fit)
-    if found is None:
+    instrumental_fit, notes = learn_instrument(pipeline, recordings, fit)
+    if instrumental_fit is None:
         return pipeline, regressions, fit, notes
-    return found.pipeline, found.regressions, found.fit, notes
+    return instrumental_fit.pipeline, instrumental_fit.regressions, instrumental_fit.fit, notes
 
 
 def describe_recursion(pipeline: Pipeline, tuning: Tuning) -> RecursionTuning:

@@ -35,21 +35,21 @@ def fit_warm_up(
     Raises NotEnoughError if no recording warms up, or what `fit_covariates` raises.
     """
     sums = [BlockSums.of(pipeline, rec) for rec in recordings]
-    power = max(float(np.mean([each.losses.mean() for each in sums])), 0.0)
+    power = max(float(np.mean([block_sums.losses.mean() for block_sums in sums])), 0.0)
     blank = WarmUp(time_constant_s=1.0, power=power, variance=fit.tuning.R)
     theta, model = _principal_direction(sums, fit)
     warm_up = _with_time_constant(blank, sums, theta, model, max(rec.duration_s for rec in recordings))
     for _ in range(ROUNDS):
-        courses = [fit_course(each, warm_up, theta, model) for each in sums]
+        courses = [fit_course(block_sums, warm_up, theta, model) for block_sums in sums]
         warm_up = warm_up.model_copy(update={"variance": _variance(sums, courses)})
-        courses = [fit_course(each, warm_up, theta, model) for each in sums]
+        courses = [fit_course(block_sums, warm_up, theta, model) for block_sums in sums]
         carried = [
-            replace(rec, channels={**rec.channels, NAME: each.at_samples(course.course, rec.samples)})
-            for rec, each, course in zip(recordings, sums, courses, strict=True)
+            replace(rec, channels={**rec.channels, NAME: block_sums.at_samples(course.course, rec.samples)})
+            for rec, block_sums, course in zip(recordings, sums, courses, strict=True)
         ]
         model, referred, fit_there = refer_to_covariates(pipeline, carried, regressions, fit, (NAME,))
         theta = fit_there.tuning.theta
-    if max(np.ptp(one.course) / one.std.max() for one in courses) < MIN_WARMING_STDS:
+    if max(np.ptp(course.course) / course.std.max() for course in courses) < MIN_WARMING_STDS:
         raise NotEnoughError("no recording warms up enough to tell what warmth does: record a start from cold")
     return model.model_copy(update={"warm_up": warm_up}), referred, fit_there, carried
 
@@ -57,10 +57,13 @@ def fit_warm_up(
 def _principal_direction(sums: Sequence[BlockSums], fit: TuningFit) -> tuple[FloatArray, CovariateModel]:
     """Return the coefficients in the middle of what the stretches show, and a straight line through them."""
     found, whose = [], []
-    for i, each in enumerate(sums):
+    for i, block_sums in enumerate(sums):
         blocks = max(round(STRETCH / BLOCK_MEMORIES), 1)
-        for first in range(0, len(each.first) - blocks + 1, blocks):
-            A, b = each.normal[first : first + blocks].sum(axis=0), each.moment[first : first + blocks].sum(axis=0)
+        for first in range(0, len(block_sums.first) - blocks + 1, blocks):
+            A, b = (
+                block_sums.normal[first : first + blocks].sum(axis=0),
+                block_sums.moment[first : first + blocks].sum(axis=0),
+            )
             if np.linalg.matrix_rank(A / np.sqrt(np.outer(np.diag(A), np.diag(A)))) == len(A):
                 found.append((solve_scaled(A, b), A))
                 whose.append(i)
@@ -107,7 +110,7 @@ def _with_time_constant(
         return blank.model_copy(update={"time_constant_s": float(np.exp(log_s))})
 
     def cost(log_s: float) -> float:
-        return sum(fit_course(each, made(log_s), theta, model).cost for each in sums)
+        return sum(fit_course(block_sums, made(log_s), theta, model).cost for block_sums in sums)
 
     tried = np.linspace(np.log(sums[0].seconds), np.log(MAX_DURATIONS * duration_s), TIME_CONSTANT_GRID_SIZE)
     best = int(np.argmin([cost(one) for one in tried]))
@@ -118,7 +121,8 @@ def _with_time_constant(
 def _variance(sums: Sequence[BlockSums], courses: Sequence[WarmUpFit]) -> float:
     """Return the variance of eta's residual that sums over blocks show, whatever its colour within them."""
     each = [
-        np.trace(np.linalg.solve(one.normal.sum(axis=0), fit.residual.T @ fit.residual)) / one.moment.shape[1]
-        for one, fit in zip(sums, courses, strict=True)
+        np.trace(np.linalg.solve(block_sums.normal.sum(axis=0), fit.residual.T @ fit.residual))
+        / block_sums.moment.shape[1]
+        for block_sums, fit in zip(sums, courses, strict=True)
     ]
     return float(np.mean(each))

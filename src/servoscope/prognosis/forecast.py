@@ -135,8 +135,8 @@ def prognose(series: SizeSeries, limit: float, coverage: float = 0.9) -> Prognos
         message("prognosis.level", name=series.name, level=_estimate(value), rate=_estimate(rate)),
         message("prognosis.odds" if odds < MAX_ODDS_SHOWN else "prognosis.certain", history=history, odds=odds),
         *(
-            message("prognosis.effect", name=series.name, covariate=each, size=_estimate(effects[each]))
-            for each in effects
+            message("prognosis.effect", name=series.name, covariate=effect, size=_estimate(effects[effect]))
+            for effect in effects
         ),
     ]
     asked |= {"value": value, "rate_per_day": rate, "odds": odds, "effects": effects, "reasons": reasons}

@@ -54,7 +54,7 @@ class SizeSeries:
         columns = [np.asarray(each, dtype=float) for each in (t, value)]
         columns.append(np.zeros_like(columns[0]) if std is None else np.asarray(std, dtype=float))
         columns += [np.asarray(each, dtype=float) for each in (covariates or {}).values()]
-        lengths = sorted({each.size for each in columns})
+        lengths = sorted({column.size for column in columns})
         if len(lengths) > 1:
             raise PrognosisError(f"{name}: its columns have different lengths, {lengths[0]} and {lengths[-1]}")
         table = np.stack(columns)
@@ -70,7 +70,7 @@ class SizeSeries:
         keep = self.t >= t
         if not keep.any():
             raise PrognosisError(f"{self.name}: has no value from that date on, its last one is earlier")
-        covariates = {name: each[keep] for name, each in self.covariates.items()}
+        covariates = {name: covariate[keep] for name, covariate in self.covariates.items()}
         return replace(self, t=self.t[keep], value=self.value[keep], std=self.std[keep], covariates=covariates)
 
     def thinned(self, points: int) -> SizeSeries:
@@ -89,7 +89,7 @@ class SizeSeries:
             return np.bincount(part, weight * column) / total
 
         std = np.sqrt(1.0 / total) if certain.all() else np.zeros(total.size)
-        covariates = {name: mean(each) for name, each in self.covariates.items()}
+        covariates = {name: mean(covariate) for name, covariate in self.covariates.items()}
         return SizeSeries(self.name, mean(self.t), mean(self.value), std, covariates)
 
 
@@ -144,8 +144,8 @@ def read_sizes(
         spread = others.pop(0)
     elif interval:
         spread = (others.pop(1) - others.pop(0)) / (2.0 * NORMAL_95)
-    found = SizeSeries.from_arrays(value, t, values, spread, dict(zip(covariates, others, strict=True)))
-    return found if after is None else found.after(after)
+    series = SizeSeries.from_arrays(value, t, values, spread, dict(zip(covariates, others, strict=True)))
+    return series if after is None else series.after(after)
 
 
 def _number(text: str) -> float:

@@ -128,7 +128,7 @@ def scale_series(series: SizeSeries) -> tuple[ScaledSeries, float, float, float]
     size = max(float(np.ptp(series.value)), 4.0 * noise, 1e-9 * abs(origin), 1e-300)
     # 1e-12: of values that repeat exactly
     R = np.maximum(np.maximum(np.square(series.std), scatter) / size**2, 1e-12)
-    inputs = np.array([_standardised(each) for each in series.covariates.values()]).reshape(-1, R.size)
+    inputs = np.array([_standardised(covariate) for covariate in series.covariates.values()]).reshape(-1, R.size)
     scaled = ScaledSeries((series.t - series.t[0]) / length, (series.value - origin) / size, R, inputs)
     return scaled, origin, size, length
 

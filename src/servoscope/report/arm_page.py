@@ -42,14 +42,15 @@ def render_arm_page(diagnosis: Diagnosis, examination: ArmExamination, baseline:
         diagnosis=diagnosis,
         name=baseline.loop.name,
         figures=[(name, lead, render_svg(figure, f"a{i}")) for i, (name, lead, figure) in enumerate(figures)],
-        provenance={"baseline": baseline.hash, "recordings": ", ".join(each.name for each in baseline.sources)},
+        provenance={"baseline": baseline.hash, "recordings": ", ".join(source.name for source in baseline.sources)},
     )
 
 
 def joint_odds(diagnosis: Diagnosis, names: tuple[str, ...]) -> list[float]:
     """Return the probability that each joint has changed."""
     return [
-        sum(each.probability for each in diagnosis.candidates if each.name.endswith(f" of {name}")) for name in names
+        sum(candidate.probability for candidate in diagnosis.candidates if candidate.name.endswith(f" of {name}"))
+        for name in names
     ]
 
 

@@ -65,7 +65,7 @@ def plot_size_precision(study: DesignStudy) -> Figure:
     ax = figure.subplots()
     for i, fault in enumerate(study.faults.values()):
         tone = TONES[i % len(TONES)]
-        known = [(each.seconds, each.std) for each in fault.sizes if each.std is not None]
+        known = [(size.seconds, size.std) for size in fault.sizes if size.std is not None]
         if known:
             ax.plot(*zip(*known, strict=True), color=tone, marker=".", label=fault.name)
     ax.set(xscale="log", yscale="log", xlabel="time after the onset [s]", ylabel="standard deviation")

@@ -97,7 +97,7 @@ def limits_table(study: DesignStudy) -> ResultTable:
 def cosines_table(study: DesignStudy | BaselineStudy) -> ResultTable:
     """Return how alike small changes look, each against each."""
     names = tuple(study.faults)
-    rows = [(one, *(f"{study.cosines[one][other]:.3f}".replace("-", "−") for other in names)) for one in names]
+    rows = [(name, *(f"{study.cosines[name][other]:.3f}".replace("-", "−") for other in names)) for name in names]
     return ResultTable(("Alike (cosine)", *names), rows)
 
 
@@ -111,14 +111,14 @@ def mimics_table(study: DesignStudy, *, described: bool = False) -> ResultTable:
 
     rows: list[tuple[str, ...]] = [
         (
-            f"{each.words} ({each.name})" if described else each.name,
-            each.imitates,
-            format_number(each.cosines[each.imitates], 3),
-            amount(each.amount, each.unit),
-            format_change(each.looks_like),
-            amount(each.told_apart, each.unit),
+            f"{mimic.words} ({mimic.name})" if described else mimic.name,
+            mimic.imitates,
+            format_number(mimic.cosines[mimic.imitates], 3),
+            amount(mimic.amount, mimic.unit),
+            format_change(mimic.looks_like),
+            amount(mimic.told_apart, mimic.unit),
         )
-        for each in study.mimics
+        for mimic in study.mimics
     ]
     head = ("Not in the list", "Is most like", "Cosine", "So much", "Looks like", "Told apart from")
     return ResultTable(head, rows, words=2)

@@ -203,8 +203,8 @@ def _timeline(d: Diagnosis, known: DiagnosisContext) -> tuple[ResultTable, ...]:
     if d.current.end_interval_s is None and len(d.intervals) < 2:
         return ()
     rows = [
-        (*_interval_ends(each, known), _interval_sizes(each), format_probability(each.probability or 0.0))
-        for each in d.intervals
+        (*_interval_ends(interval, known), _interval_sizes(interval), format_probability(interval.probability or 0.0))
+        for interval in d.intervals
     ]
     return (ResultTable(("From", "To", "Fault", "Probability"), rows, words=3),)
 
@@ -237,7 +237,7 @@ def _explanations(d: Diagnosis, known: DiagnosisContext) -> Iterator[ResultTable
 
 
 def _candidate_row(c: Candidate, known: DiagnosisContext) -> tuple[str, ...]:
-    name = " + ".join(translate(fault_label(each)) for each in c.names)
+    name = " + ".join(translate(fault_label(name)) for name in c.names)
     meaning = describe_candidate(c, known.words)
     lines = [name, *([meaning] if meaning.replace(f" {translate('and')} ", " + ") != name else [])]
     if c.covariance is not None:

@@ -226,8 +226,8 @@ def _plane(ax: Axes, trace: Trace, i: int, usable: BoolArray, onset: float) -> N
         if not np.isfinite(H):
             continue
         if np.isfinite(covariance).all():
-            one = FrequencyResponse(response.frequencies[i : i + 1], H[None], covariance[None])
-            outline = one.ellipse(96)[0]
+            frequency_response = FrequencyResponse(response.frequencies[i : i + 1], H[None], covariance[None])
+            outline = frequency_response.ellipse(96)[0]
             ax.fill(*outline.T, facecolor=colour, alpha=alpha, linewidth=0)
             ax.plot(*outline.T, color=colour, linewidth=1.1)
             shown.append(outline)
@@ -258,16 +258,18 @@ def _gaps(ax: Axes, t: FloatArray, restart: BoolArray, longest: float) -> None:
 def _marks(ax: Axes, diagnosis: Diagnosis | None, factor: float) -> None:
     if diagnosis is None:
         return
-    for one in diagnosis.intervals:
-        for change in (one.onset_s, one.end_interval_s):
+    for interval in diagnosis.intervals:
+        for change in (interval.onset_s, interval.end_interval_s):
             if change is not None:
                 low, likely, high = (value / factor for value in change)
                 ax.axvspan(low, high, facecolor=ALARM, edgecolor=ALARM, linewidth=0.5, alpha=0.22, zorder=0)
                 ax.axvline(likely, color=ALARM, linewidth=1.0, alpha=0.8, zorder=1)
-        if one.onset_s is not None and (len(diagnosis.intervals) > 1 or one.end_interval_s is not None):
+        if interval.onset_s is not None and (len(diagnosis.intervals) > 1 or interval.end_interval_s is not None):
             # how long each lasted: a band along the top
-            end = ax.get_xlim()[1] if one.end_s is None else one.end_s / factor
-            ax.axvspan(one.onset_s[1] / factor, end, ymin=0.96, facecolor=ALARM, linewidth=0.0, alpha=0.8, zorder=3)
+            end = ax.get_xlim()[1] if interval.end_s is None else interval.end_s / factor
+            ax.axvspan(
+                interval.onset_s[1] / factor, end, ymin=0.96, facecolor=ALARM, linewidth=0.0, alpha=0.8, zorder=3
+            )
     if diagnosis.detected_at_s is not None:
         ax.axvline(diagnosis.detected_at_s / factor, color=INK, linewidth=0.9, linestyle=(0, (2, 2)), zorder=2)
 
@@ -341,15 +343,15 @@ def _interval(ax: Axes, fault: FaultEstimate, at: float, colour: str) -> None:
 
 def _joint(ax: Axes, best: Candidate) -> None:
     """Draw where both sizes are with 95 % probability."""
-    one, other = best.faults
+    estimate, other = best.faults
     angle = np.linspace(0.0, 2.0 * np.pi, 97)
     values, vectors = np.linalg.eigh(np.array(best.covariance))
     root = vectors * np.sqrt(np.maximum(values, 0.0) * CHI2_95_2DOF)
-    x, y = np.exp(np.log([[one.ratio], [other.ratio]]) + root @ np.array([np.cos(angle), np.sin(angle)]))
+    x, y = np.exp(np.log([[estimate.ratio], [other.ratio]]) + root @ np.array([np.cos(angle), np.sin(angle)]))
     ax.fill(x, y, facecolor=MEASURED, alpha=0.24, linewidth=0)
     ax.plot(x, y, color=MEASURED, linewidth=1.1)
-    ax.plot(one.ratio, other.ratio, "o", markersize=5.5, color=MEASURED)
-    ax.set(xlabel=text_symbol(one.parameter), ylabel=text_symbol(other.parameter))
+    ax.plot(estimate.ratio, other.ratio, "o", markersize=5.5, color=MEASURED)
+    ax.set(xlabel=text_symbol(estimate.parameter), ylabel=text_symbol(other.parameter))
     ax.set_title("both at once, 95 %", loc="left", fontweight="bold")
     ax.locator_params(nbins=4)
     ax.grid(visible=True, color=RULE, linewidth=0.6)

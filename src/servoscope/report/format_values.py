@@ -91,14 +91,15 @@ def format_with_std(value: float, std: float, *others: float) -> tuple[str, ...]
     """Return value, standard deviation and further values, all to the digits that the deviation supports."""
     values = (value, std, *others)
     if not (math.isfinite(value) and math.isfinite(std) and std > 0.0):
-        return tuple(format_number(each) for each in values)
-    top = max((abs(each) for each in values if math.isfinite(each)), default=0.0)
+        return tuple(format_number(value) for value in values)
+    top = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
     exponent = math.floor(math.log10(top)) if top > 0.0 else 0
     exponent = 0 if -3 <= exponent < 6 else exponent
     decimals = number_format.count_decimals(std / 10.0**exponent, most=7)
     power = _power(exponent) if exponent else ""
     return tuple(
-        _true_minus(f"{each / 10.0**exponent:.{decimals}f}") + power if math.isfinite(each) else DASH for each in values
+        _true_minus(f"{value / 10.0**exponent:.{decimals}f}") + power if math.isfinite(value) else DASH
+        for value in values
     )
 
 

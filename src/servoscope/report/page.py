@@ -88,10 +88,10 @@ def write_page(path: str | Path, content: str) -> None:
 
 def find_browser(path: str | Path) -> str:
     """Return the browser that prints to a path; raises OutputError if there is none."""
-    found = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None:
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
         raise OutputError(say("report.no_browser", path=str(path), page=Path(path).with_suffix(".html").name))
-    return found
+    return browser
 
 
 def _printed(page: bytes, path: str | Path) -> bytes:

@@ -43,7 +43,7 @@ def channels_summary(name: str, channels: Sequence[ChannelInfo]) -> dict[str, ob
 def baseline_summary(b: Baseline) -> dict[str, object]:
     """Return what was learned; by operating point where these have names."""
     if b.points:
-        return {"loop": b.loop.name, "points": {each.point: _point_summary(each) for each in b.per_point}}
+        return {"loop": b.loop.name, "points": {baseline.point: _point_summary(baseline) for baseline in b.per_point}}
     return _point_summary(b)
 
 

@@ -198,19 +198,19 @@ def _baseline(thing: Baseline) -> Picture:
 
 @_picture.register(Inspection)
 def _inspection(thing: Inspection) -> Picture:
-    f = np.array([one.frequency_hz for one in thing.frequencies])
+    f = np.array([frequency.frequency_hz for frequency in thing.frequencies])
     lines = []
     for name in "uy":  # a coherence that could not be judged is left out
-        values = [getattr(one, f"coherence_{name}") for one in thing.frequencies]
+        values = [getattr(frequency, f"coherence_{name}") for frequency in thing.frequencies]
         lines.append(Line(f, np.array(values, dtype=np.float64), f"coherence r, {name}", marks=True))
     return Picture("frequency [Hz]", [Panel(lines)])
 
 
 @_picture.register(Diagnosis)
 def _diagnosis(thing: Diagnosis) -> Picture:
-    shown = {name: one for name, one in thing.parameters.items() if one.nominal != 0.0}
-    ratios = np.array([one.value / one.nominal for one in shown.values()])
-    spread = np.array([Z95 * one.std / abs(one.nominal) for one in shown.values()])
+    shown = {name: parameter for name, parameter in thing.parameters.items() if parameter.nominal != 0.0}
+    ratios = np.array([coefficient.value / coefficient.nominal for coefficient in shown.values()])
+    spread = np.array([Z95 * coefficient.std / abs(coefficient.nominal) for coefficient in shown.values()])
     panel = Panel([Line(ratios, list(shown), half_width=spread)], healthy=True)
     title = f"{thing.recording}: {thing.verdict}"
     return Picture("estimate over what a healthy loop would show", [panel], title=title)

@@ -20,14 +20,14 @@ def plot_signature(
     figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
     of_position, of_speed = figure.subplots(1, 2, sharey=True)
     shown = [(before, COLOURS["healthy"], "before"), (after, COLOURS["measured"], "after" if before else "measured")]
-    kept = [(each, colour, words) for each, colour, words in shown if each is not None]
-    y_unit, y_scale = axis_scale([each.position for each, *_ in kept], units[0])
-    v_unit, v_scale = axis_scale([each.speed for each, *_ in kept], f"{units[0]}/s" if units[0] else "")
-    u_unit, u_scale = axis_scale([each.by_speed for each, *_ in kept], units[1])
-    for each, colour, _ in kept:
-        of_position.plot(y_scale * each.position, u_scale * each.forward, color=colour)
-        of_position.plot(y_scale * each.position, u_scale * each.backward, color=colour, linestyle="--")
-        of_speed.plot(v_scale * each.speed, u_scale * each.by_speed, color=colour, marker="o", markersize=2.5)
+    kept = [(signature, colour, words) for signature, colour, words in shown if signature is not None]
+    y_unit, y_scale = axis_scale([signature.position for signature, *_ in kept], units[0])
+    v_unit, v_scale = axis_scale([signature.speed for signature, *_ in kept], f"{units[0]}/s" if units[0] else "")
+    u_unit, u_scale = axis_scale([signature.by_speed for signature, *_ in kept], units[1])
+    for signature, colour, _ in kept:
+        of_position.plot(y_scale * signature.position, u_scale * signature.forward, color=colour)
+        of_position.plot(y_scale * signature.position, u_scale * signature.backward, color=colour, linestyle="--")
+        of_speed.plot(v_scale * signature.speed, u_scale * signature.by_speed, color=colour, marker="o", markersize=2.5)
     of_position.set_xlabel(f"output y [{y_unit}]" if y_unit else "output y")
     of_position.set_ylabel(f"mean u [{u_unit}]" if u_unit else "mean u")
     of_speed.set_xlabel(f"speed of y [{v_unit}]" if v_unit else "speed of y")

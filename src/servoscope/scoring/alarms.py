@@ -99,7 +99,7 @@ def detections(alarms: Sequence[npt.ArrayLike], onsets: npt.ArrayLike, within: f
         A detection later than this after the onset counts as a miss.
     """
     onset = np.broadcast_to(np.asarray(onsets, dtype=np.float64), (len(alarms),))
-    times = [np.sort(np.asarray(each, dtype=np.float64)) for each in alarms]
+    times = [np.sort(np.asarray(alarm, dtype=np.float64)) for alarm in alarms]
     before = np.array([np.searchsorted(t, at) for t, at in zip(times, onset, strict=True)], dtype=np.int64)
     first = np.array([t[i] if i < t.size else np.inf for t, i in zip(times, before, strict=True)])
     delays = first - onset

@@ -104,7 +104,7 @@ def resume_assets(
     uncounted, behind = list[Block](), set[str]()  # behind: assets of which the store may know more than their states
     stored = store.recent_samples_of([name for name in assets if name in rows])
     for name, samples in chain(stored, ((name, []) for name in assets if name not in rows)):
-        asset, blocks = assets[name], [Block.unpack(name, *one) for one in samples]
+        asset, blocks = assets[name], [Block.unpack(name, *sample) for sample in samples]
         if name in restarted and name in rows:
             position = StreamPosition(**rows[name]["status"]["counted"])
             for block in blocks[bisect.bisect_left(blocks, position.blocks, key=lambda one: one.sequence) :]:
@@ -206,11 +206,13 @@ def build_assets(config: ServiceFile) -> dict[str, Asset]:
             resolved[asked] = _resolve_limits(shared[path, point][0].loop, limits, name)
         policy = replace(policy, limits=resolved[asked], pause_s=config.sources[settings.source].pause_s)
         assets[name] = Asset(name, *shared[path, point], policy, settings.group, settings.source)
-    known = [fault.name for one in assets.values() for fault in one.baseline.loop.plant.all_faults]
+    known = [fault.name for asset in assets.values() for fault in asset.baseline.loop.plant.all_faults]
     _check_names("[prognosis] limits", "fault", config.prognosis.limits, known)
-    for asset in {id(one.baseline): one for one in assets.values()}.values():
+    for asset in {id(asset.baseline): asset for asset in assets.values()}.values():
         asset.compile_kernels()
-    for asset in {one.monitor.lane_key or one.baseline.loop.plant.kind: one for one in assets.values()}.values():
+    for asset in {
+        asset.monitor.lane_key or asset.baseline.loop.plant.kind: asset for asset in assets.values()
+    }.values():
         compile_examination(asset.baseline)  # one of each kind: its kernels are those of all others
     return assets
 
@@ -220,7 +222,11 @@ def _check_covariates(config: ServiceFile, name: str, baseline: Baseline) -> Non
     asset = config.assets[name]
     source, key = config.sources[asset.source], config.sources[asset.source].asset_key
     address = getattr(asset, key) if key else None
-    lacking = [one for one in baseline.logged_covariates if not source.carries(one, address)]
+    lacking = [
+        logged_covariate
+        for logged_covariate in baseline.logged_covariates
+        if not source.carries(logged_covariate, address)
+    ]
     if lacking:
         where = (
             f"[assets.{name}] nodes.covariates"
@@ -241,23 +247,25 @@ def _resolve_limits(loop: Loop, limits: Mapping[str, float | LimitKind], asset: 
             resolved[fault] = limit
             continue
         try:
-            found = next(one for one in operating_limits(loop, [fault]) if one.kind == limit)
+            operating_limit = next(
+                operating_limit for operating_limit in operating_limits(loop, [fault]) if operating_limit.kind == limit
+            )
         except LoopError as error:
             raise ConfigError(f'limits of {asset}: {fault} = "{limit}": {error}') from None
-        if found.up is None and found.down is None:
+        if operating_limit.up is None and operating_limit.down is None:
             raise ConfigError(
                 f'limits of {asset}: {fault} = "{limit}": no size of {fault} takes that from this loop, give a number'
             )
-        resolved[fault] = found
+        resolved[fault] = operating_limit
     return resolved
 
 
 def source_assets(config: ServiceFile, assets: Mapping[str, Asset], source: str) -> dict[str, SourceAsset]:
     """Return what a source is told of its assets."""
     key, found = config.sources[source].asset_key, dict[str, SourceAsset]()
-    for name, one in config.assets.items():
-        if one.source == source:
-            baseline, address = assets[name].baseline, getattr(one, key) if key else None
+    for name, asset in config.assets.items():
+        if asset.source == source:
+            baseline, address = assets[name].baseline, getattr(asset, key) if key else None
             found[name] = SourceAsset(
                 baseline.loop, address, config.service.ahead_s, covariates=baseline.logged_covariates
             )
@@ -294,15 +302,15 @@ def check_actions(config: ServiceFile, assets: Mapping[str, Asset]) -> None:
             _check_names(f"{where}.assets", "asset", sink.assets or (), [*assets, config.name])
             _check_names(f"{where}.alarms", "alarm", sink.alarms or (), config.alarms.definitions)
             _check_sink(where, sink, config.folder)
-    for name, one in config.actions.tolerance.items():
+    for name, fault_tolerance_settings in config.actions.tolerance.items():
         where = f"[actions] tolerance.{name}"
-        _check_names(f"{where}.assets", "asset", one.assets, assets)
-        for asset in one.assets:
+        _check_names(f"{where}.assets", "asset", fault_tolerance_settings.assets, assets)
+        for asset in fault_tolerance_settings.assets:
             baseline = assets[asset].baseline
             faults = [fault.name for fault in baseline.loop.plant.all_faults] + [
                 fault.name for fault in baseline.learned
             ]
-            _check_names(f"{where}.fault", f"fault of {asset}", [one.fault], faults)
+            _check_names(f"{where}.fault", f"fault of {asset}", [fault_tolerance_settings.fault], faults)
 
 
 def _check_sink(where: str, sink: Sink, folder: Path) -> None:

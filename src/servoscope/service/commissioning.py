@@ -50,11 +50,11 @@ def listen(config: ServiceFile, seconds: float) -> list[CommissioningRow]:
                 for block in source.poll(1000):
                     blocks[block.asset].append(block)
                     logs[block.asset].hear(now)
-                for one in source.rejections.take():
-                    if one.asset:
-                        logs[one.asset].refuse(now, one.reason)
+                for rejection in source.rejections.take():
+                    if rejection.asset:
+                        logs[rejection.asset].refuse(now, rejection.reason)
                     else:
-                        strange[name] = one.reason
+                        strange[name] = rejection.reason
             if all(len(blocks[name]) >= MIN_BLOCKS_FOR_RATE for name in assets):
                 break
             time.sleep(POLL_S)

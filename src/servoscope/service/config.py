@@ -157,13 +157,13 @@ class ServiceFile(FileSettings):
         if number is None:
             return self
         workers, name = self.service.workers, self.shard_name(number)
-        assets = {key: one for key, one in self.assets.items() if shard_number(key, workers) == number}
-        used = {one.source for one in assets.values()}
+        assets = {key: asset for key, asset in self.assets.items() if shard_number(key, workers) == number}
+        used = {asset.source for asset in assets.values()}
         listen = "127.0.0.1:0" if self.service.listen else ""  # whom it tells the port asks it there
         update = {
             "name": name,
             "assets": assets,
-            "sources": {key: one for key, one in self.sources.items() if key in used},
+            "sources": {key: source for key, source in self.sources.items() if key in used},
             "service": self.service.model_copy(update={"listen": listen}),
             "actions": self.actions.with_service_name(self.name, name),
             "web": None,

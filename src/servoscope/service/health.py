@@ -71,7 +71,10 @@ def status_gauges(statuses: Iterable[tuple[str, AssetStatus]]) -> Iterator[Metri
     count: Counter[tuple[str, str, str]] = Counter()
     for name, status in statuses:
         verdicts.add_metric([name, status.verdict], 1.0)
-        count.update((alarm, one.priority or "", one.state.value) for alarm, one in status.alarms.items())
+        count.update(
+            (alarm, alarm_status.priority or "", alarm_status.state.value)
+            for alarm, alarm_status in status.alarms.items()
+        )
     yield from (verdicts, alarm_gauge(count))
 
 

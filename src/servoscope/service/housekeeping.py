@@ -83,7 +83,7 @@ class Housekeeping:
         writer, notifier, now = self._service.writer, self._service.notifier, self._service.clock.now()
         result = notifier.check_service(writer.fill_ratio, self._service.troubles, now)
         self._handle_own(result, now)
-        clocks = [one.t for one in self._service.assets.values() if one.heard]
+        clocks = [asset.t for asset in self._service.assets.values() if asset.heard]
         writer.add(notifier.name, notifier.advance_time(max(clocks, default=0.0), now))
 
     def _handle_own(self, result: StepResult, now: float) -> None:
@@ -92,29 +92,42 @@ class Housekeeping:
         writer.add(notifier.name, notifier.notify(result.transitions, {}, now))
 
     def _store_deliveries(self) -> None:
-        for one in self._service.dispatcher.take_attempts():
-            log("info" if one.delivered else "warning", "delivery", key=one.key, sink=one.sink, outcome=one.detail)
-            due = None if one.retry_entry is None else one.retry_entry.due
-            row = {"attempts": one.attempt, "due": due, "outcome": one.detail}
-            self._service.writer.batch.deliveries[one.key] = row
+        for attempt in self._service.dispatcher.take_attempts():
+            log(
+                "info" if attempt.delivered else "warning",
+                "delivery",
+                key=attempt.key,
+                sink=attempt.sink,
+                outcome=attempt.detail,
+            )
+            due = None if attempt.retry_entry is None else attempt.retry_entry.due
+            row = {"attempts": attempt.attempt, "due": due, "outcome": attempt.detail}
+            self._service.writer.batch.deliveries[attempt.key] = row
 
     def _store_rejections(self) -> None:
         """Store what came from outside and could not be used: at once, then once a minute, for each of its kinds."""
         for name, source in self._service.sources.items():
-            for one in source.rejections.take():
-                self._service.metrics.record_rejection(name, one)
-                if one.asset:
-                    self._service.note_refusal(one.asset, one.reason)
-                self._rejections.add(one.asset or name, one.kind, one.reason, one.count)
+            for rejection in source.rejections.take():
+                self._service.metrics.record_rejection(name, rejection)
+                if rejection.asset:
+                    self._service.note_refusal(rejection.asset, rejection.reason)
+                self._rejections.add(rejection.asset or name, rejection.kind, rejection.reason, rejection.count)
         now = time.monotonic()
-        for one in self._rejections.take():
-            if now < self._next_rejections.get((one.asset, one.kind), 0.0):
-                self._rejections.add(one.asset, one.kind, one.reason, one.count)
+        for rejection in self._rejections.take():
+            if now < self._next_rejections.get((rejection.asset, rejection.kind), 0.0):
+                self._rejections.add(rejection.asset, rejection.kind, rejection.reason, rejection.count)
                 continue
-            self._next_rejections[one.asset, one.kind] = now + REJECTIONS_EVERY_S
-            log("warning", "refused", of=one.asset, kind=one.kind, count=one.count, why=one.reason)
-            document = {"kind": one.kind, "count": one.count, "why": one.reason}
-            self._service.writer.add(one.asset, [audit_row("refused", document)])
+            self._next_rejections[rejection.asset, rejection.kind] = now + REJECTIONS_EVERY_S
+            log(
+                "warning",
+                "refused",
+                of=rejection.asset,
+                kind=rejection.kind,
+                count=rejection.count,
+                why=rejection.reason,
+            )
+            document = {"kind": rejection.kind, "count": rejection.count, "why": rejection.reason}
+            self._service.writer.add(rejection.asset, [audit_row("refused", document)])
 
     def _take_announcements(self) -> None:
         """Let assets know what people have noted to be done to them, until their next baseline is in force."""
@@ -170,7 +183,7 @@ class Housekeeping:
             return
         self._next_retention = now + RETENTION_EVERY_S
         service, store = self._service, self._service.store
-        clocks = {name: one.t for name, one in service.assets.items() if one.has_state}
+        clocks = {name: asset.t for name, asset in service.assets.items() if asset.has_state}
         deleted = delete_old_rows(store, service.config.store, service.config.name, clocks, service.clock.now())
         for table, count in deleted.items():
             log("info", f"old {table} deleted", rows=count)

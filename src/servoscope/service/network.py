@@ -100,4 +100,4 @@ def apply_network(tables: Mapping[str, T], network: NetworkSettings) -> dict[str
         is_open = isinstance(one, ConnectionSettings) and one.network is None
         return one.model_copy(update={"network": network}) if is_open else one
 
-    return {name: apply(one) for name, one in tables.items()}
+    return {name: apply(table) for name, table in tables.items()}

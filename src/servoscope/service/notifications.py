@@ -66,8 +66,10 @@ class Notifier:
             "version": VERSION,
             "rows": self._rows,
             "flood": self._flood.to_dict(),
-            "own": {name: one.to_dict() for name, one in self._service_alarms.items()},
-            "tolerance": {name: one.to_dict() for name, one in self._tolerance.items()},
+            "own": {name: service_alarm.to_dict() for name, service_alarm in self._service_alarms.items()},
+            "tolerance": {
+                name: fault_tolerance_state.to_dict() for name, fault_tolerance_state in self._tolerance.items()
+            },
         }
         text = json.dumps(plain, allow_nan=False).encode()
         state = hashlib.sha256(text).digest() + text
@@ -80,22 +82,22 @@ class Notifier:
         definitions = self._alarms.definitions  # a service file may have lost one of which a state is left
         alarms = {
             name: {
-                "state": one.state.value,
-                "since": one.since,
+                "state": service_alarm.state.value,
+                "since": service_alarm.since,
                 "priority": definitions[kind].priority if (kind := alarm_kind(name)) in definitions else None,
-                "cause": one.cause,
-                "until": one.shelved_until,
+                "cause": service_alarm.cause,
+                "until": service_alarm.shelved_until,
             }
-            for name, one in self._service_alarms.items()
+            for name, service_alarm in self._service_alarms.items()
         }
         return {"service": True, "flood": flood, "alarms": alarms}
 
     def notify(self, transitions: Iterable[AlarmTransition], details: Mapping[str, Any], now: float) -> list[TableRow]:
         """Take transitions of an asset, in the order of time; return rows for outbox and audit."""
         rows: list[TableRow] = []
-        for one in transitions:
-            priority = self._alarms.find(one.alarm).priority
-            self._flood, notices = notify_transition(self._alarms.flood, self._flood, one, priority)
+        for transition in transitions:
+            priority = self._alarms.find(transition.alarm).priority
+            self._flood, notices = notify_transition(self._alarms.flood, self._flood, transition, priority)
             rows += self._notification_rows(notices, details, now)
         return rows
 
@@ -114,9 +116,9 @@ class Notifier:
                 rows.append(audit_row(notice.kind, document))
                 entries = actions.flood_entries(self._settings, notice, now)
             else:
-                one = notice.transition
-                sent = {**self._advice(one.alarm), **details}
-                entries = actions.transition_entries(self._settings, one, notice.priority, now, sent)
+                transition = notice.transition
+                sent = {**self._advice(transition.alarm), **details}
+                entries = actions.transition_entries(self._settings, transition, notice.priority, now, sent)
             rows += map(self._outbox_row, entries)
         return rows
 
@@ -133,18 +135,22 @@ class Notifier:
         alarm = alarms.get(FAULT_ALARM)
         if alarm is None or alarm.state in QUIET_STATES:
             return []
-        if any(one.key == (alarm.asset, FAULT_ALARM) for one in self._flood.held):
+        if any(held_alarm.key == (alarm.asset, FAULT_ALARM) for held_alarm in self._flood.held):
             return []
         found = {"verdict": diagnosis.verdict, "diagnosis": diagnosis.summary, "onset": diagnosis.onset}
         details = {**self._advice(FAULT_ALARM), **found, "faults": diagnosis.document.get("faults", [])}
         details["checks"] = diagnosis.document.get("checks", [])
         priority = self._alarms.definitions[FAULT_ALARM].priority
         sent = actions.diagnosis_entries(self._settings, alarm, priority, t, now, diagnosis.summary, details)
-        return [self._outbox_row(one) for one in sent]
+        return [self._outbox_row(outbox_entry) for outbox_entry in sent]
 
     def check_service(self, fill_ratio: float, troubles: Mapping[str, str], now: float) -> StepResult:
         """Take how full the buffer is, and what is wrong with each connection; advance the service's own alarms."""
-        own = {key: one for key, one in self._service_alarms.items() if key.partition(".")[2] in ("", *troubles)}
+        own = {
+            key: service_alarm
+            for key, service_alarm in self._service_alarms.items()
+            if key.partition(".")[2] in ("", *troubles)
+        }
         self._service_alarms, transitions = own, list[AlarmTransition]()
         for name, definition in self._alarms.service_alarms.items():
             if definition.source == "connection":
@@ -154,8 +160,8 @@ class Notifier:
                 snapshots = {name: AssetSnapshot(buffered=fill_ratio, cause=cause)}
             for key, snapshot in snapshots.items():
                 before = own.get(key) or initial_alarm_state(self.name, key, now)
-                own[key], found = step_alarm(definition, before, snapshot, now)
-                transitions += found
+                own[key], alarm_transition = step_alarm(definition, before, snapshot, now)
+                transitions += alarm_transition
         return self._step_result(transitions)
 
     def execute(self, alarm: str, command: OperatorCommand, now: float) -> StepResult:
@@ -171,8 +177,8 @@ class Notifier:
 
     def _step_result(self, transitions: Sequence[AlarmTransition]) -> StepResult:
         rows = []
-        for number, one in enumerate(transitions, self._rows + 1):
-            row = transition_row(one, self._alarms.find(one.alarm))
+        for number, transition in enumerate(transitions, self._rows + 1):
+            row = transition_row(transition, self._alarms.find(transition.alarm))
             rows.append(TableRow("transitions", {"number": number, **row}))
         self._rows += len(rows)
         return StepResult(rows, list(transitions))

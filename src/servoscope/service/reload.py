@@ -50,11 +50,11 @@ def reload_components(
         for name in config.sources
     }
     publishers = {
-        name: running.publishers[name] if before.outlets.get(name) == one else build_publisher(config, name)
-        for name, one in config.outlets.items()
+        name: running.publishers[name] if before.outlets.get(name) == outlet else build_publisher(config, name)
+        for name, outlet in config.outlets.items()
     }
     commit()
-    store, new = running.store, {name: one for name, one in assets.items() if one is not running.assets.get(name)}
+    store, new = running.store, {name: asset for name, asset in assets.items() if asset is not running.assets.get(name)}
     try:
         store.acquire_lock([config.name, *assets])
         rows = store.checkpoints([config.name, *assets])
@@ -81,10 +81,10 @@ def reload_components(
     for publisher in running.publishers.values():
         if publisher not in publishers.values():
             publisher.close()
-    opened = [name for name, one in sources.items() if one is not running.sources.get(name)]
+    opened = [name for name, source in sources.items() if source is not running.sources.get(name)]
     for name in opened:
         open_source(config, name, sources[name], assets)
-    outlets = [name for name, one in publishers.items() if one is not running.publishers.get(name)]
+    outlets = [name for name, publisher in publishers.items() if publisher is not running.publishers.get(name)]
     for name in outlets:
         try:
             publishers[name].open({each: row["status"] for each, row in rows.items()})
@@ -108,5 +108,5 @@ def _identity(config: ServiceFile, assets: Mapping[str, Asset], name: str) -> tu
 
 def _source_identity(config: ServiceFile, assets: Mapping[str, Asset], name: str) -> tuple[Any, ...]:
     """Return all on which a source depends."""
-    own = {each: (one.loop.hash(), *one[1:]) for each, one in source_assets(config, assets, name).items()}
+    own = {each: (asset.loop.hash(), *asset[1:]) for each, asset in source_assets(config, assets, name).items()}
     return config.sources[name], own

@@ -72,14 +72,14 @@ def offers(baseline: Baseline, status: AssetStatus, kept_s: float) -> list[Messa
     healthy_s = min(status.position.t - status.since, kept_s)
     if status.verdict != "healthy" or status.learning is not None or healthy_s < min(MIN_LEARN_S, kept_s):
         return []
-    found = [message("service.renewal.ready", minutes=healthy_s / 60.0)]
+    messages = [message("service.renewal.ready", minutes=healthy_s / 60.0)]
     for more in OFFERED_RECORDINGS:
         changes = forecast_changes(baseline, more)
         name = min(changes, key=lambda each: changes[each][1] / changes[each][0], default="")
         if name and changes[name][1] < MAX_OFFERED_RATIO * changes[name][0]:
             before, after = (100.0 * size for size in changes[name])
-            found.append(message("service.renewal.offer", more=more, fault=name, before=before, after=after))
-    return found
+            messages.append(message("service.renewal.offer", more=more, fault=name, before=before, after=after))
+    return messages
 
 
 def stored_stretch(
@@ -121,7 +121,7 @@ def judge_again(store: Store, asset: str, before: Baseline, after: Baseline, now
     series = read_series(store, asset, (now - JUDGED_AGAIN_S, None), ("coefficient",))
     exceeded: dict[float, list[bool]] = {}
     shift = np.array(after.theta) - np.array(before.theta)
-    variances = [np.diag(each.covariance_array()) for each in (before, after)]
+    variances = [np.diag(baseline.covariance_array()) for baseline in (before, after)]
     for i, name in enumerate(before.names):
         for t, value, low, high, healthy in series.get(("coefficient", name), np.zeros((5, 0))).T:
             own = ((high - low) / (2.0 * NORMAL_95)) ** 2

@@ -184,10 +184,12 @@ class WorkerPool:
             files = () if store.lock_file is None else (store.lock_file,)
             self._start(files)
             next_look, is_announced = time.monotonic() + STALL_S, False
-            while not self._stopping.wait(POLL_INTERVAL_S) and not all(one.supervisor.done for one in self._workers):
+            while not self._stopping.wait(POLL_INTERVAL_S) and not all(
+                worker.supervisor.done for worker in self._workers
+            ):
                 self.last_turn = time.monotonic()
                 notify_systemd("WATCHDOG=1")
-                if not is_announced and all(one.has_begun or one.supervisor.done for one in self._workers):
+                if not is_announced and all(worker.has_begun or worker.supervisor.done for worker in self._workers):
                     is_announced = True
                     announce()
                     notify_systemd("READY=1", self._systemd_status)
@@ -198,10 +200,10 @@ class WorkerPool:
                     self._reload.clear()
                     self._change(files)
             notify_systemd("STOPPING=1")
-            for one in self._workers:
-                one.supervisor.ask_to_stop()  # all at once
-            for one in self._workers:
-                one.supervisor.stop()
+            for worker in self._workers:
+                worker.supervisor.ask_to_stop()  # all at once
+            for worker in self._workers:
+                worker.supervisor.stop()
         finally:
             store.close()
 
@@ -212,8 +214,8 @@ class WorkerPool:
 
     def _start(self, files: Sequence[int]) -> None:
         """Start a worker for each shard that has assets and none yet."""
-        running = {one.number for one in self._workers if not one.supervisor.done}
-        self._workers = [one for one in self._workers if one.number in running]
+        running = {worker.number for worker in self._workers if not worker.supervisor.done}
+        self._workers = [worker for worker in self._workers if worker.number in running]
         restarted, self.restarted = self.restarted, ()  # once
         for number in sorted(self.config.shard_numbers() - running):
             own = {*self.config.shard(number).assets, self.config.shard_name(number)}
@@ -243,7 +245,7 @@ class WorkerPool:
             notify_systemd("READY=1", f"STATUS=reload refused: {error}")
             return
         self.config = config
-        for one in self._workers:
-            one.reload()
+        for worker in self._workers:
+            worker.reload()
         self._start(files)
         notify_systemd("READY=1", self._systemd_status)

@@ -125,7 +125,7 @@ def clean(
 
 def _union(*rows: IndexArray) -> IndexArray:
     """Return the rows that are among any of these, in order."""
-    return np.unique(np.concatenate(rows)) if any(each.size for each in rows) else rows[0]
+    return np.unique(np.concatenate(rows)) if any(row.size for row in rows) else rows[0]
 
 
 def _original_rows(rows: IndexArray, dropped: IndexArray) -> IndexArray:

@@ -122,8 +122,8 @@ class LoopSimulation:
 
         called = called or [f"plant {i + 1} of {len(plants)}" for i in range(len(plants))]
         discrete = [discretise(p.state_space(), loop.sample_rate, hold=loop.hold, delay=loop.delay) for p in plants]
-        for each, what in zip(discrete, called, strict=True):
-            check_stable(loop, each, what)
+        for discrete_plant, what in zip(discrete, called, strict=True):
+            check_stable(loop, discrete_plant, what)
         self._unlimited, self._feed = loop.input_logged != "after_limiter", FeedForward(loop)
         self._kernel: Callable[..., object]
         if not loop.plant.linear:
@@ -137,7 +137,7 @@ class LoopSimulation:
                 motion, which, settings, *signals, order=order
             )
         else:
-            A, b_next, b_now, b_late, c = (np.stack([each[i] for each in discrete]) for i in range(5))
+            A, b_next, b_now, b_late, c = (np.stack([plant[i] for plant in discrete]) for i in range(5))
             states = c.shape[1]
             self._kernel = lambda which, *signals: linear_kernels.run_linear(
                 A, b_next, b_now, b_late, c, which, settings, *signals, n=states

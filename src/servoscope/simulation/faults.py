@@ -47,14 +47,14 @@ class FaultEvent:
 
         Raises SimulationError if the text has another form; without ``@`` the fault is there from the start.
         """
-        found = _EVENT_PATTERN.fullmatch(text)
-        if found is None:
+        match = _EVENT_PATTERN.fullmatch(text)
+        if match is None:
             raise SimulationError(f"fault {text!r}: write PARAMETER=RATIO@SECONDS, or PARAMETER=RATIO@SECONDS~RAMP")
         try:
-            ratio, at_s, ramp_s = (float(part) if part else 0.0 for part in found.groups()[1:])
+            ratio, at_s, ramp_s = (float(part) if part else 0.0 for part in match.groups()[1:])
         except ValueError:
             raise SimulationError(f"fault {text!r}: ratio and times must be numbers, as in C_ie=1.2@30") from None
-        return cls(found[1], ratio, at_s, ramp_s)
+        return cls(match[1], ratio, at_s, ramp_s)
 
 
 class PlantSchedule(NamedTuple):

@@ -179,7 +179,7 @@ def simulate_rig(
     acting = acting[past:]
     recording = make_recording(loop, r, limited if loop.input_logged == "after_limiter" else u, measured)
     ratios = {name: values[plan.plant_index] for name, values in plan.ratios.items()}
-    theta = np.array([each.theta() for each in plan.plants])[plan.plant_index]
+    theta = np.array([plant.theta() for plant in plan.plants])[plan.plant_index]
     return recording, RigTruth(t, y, acting, ratios, theta, events, plant, p_L, spool, temperature, parameters)
 
 

@@ -62,7 +62,9 @@ def asset_document(status: AssetStatus, diagnosis: Diagnosis | None, checks: Seq
         sections.append(Section("What to do", (Notes((_next_step(status),)),), HEADLINE))
     if is_fault and diagnosis is not None:
         known = DiagnosisContext(words=status.metadata.faults)
-        sections += [one for one in diagnosis_document(diagnosis, known) if one.title == "What else it could be"]
+        sections += [
+            section for section in diagnosis_document(diagnosis, known) if section.title == "What else it could be"
+        ]
     return tuple(section for section in sections if section.body)
 
 
@@ -81,8 +83,8 @@ def _facts(status: AssetStatus, diagnosis: Diagnosis | None) -> Iterator[Fact]:
     lasted = say("report.lasting", duration=format_duration(max(status.position.t - since, 0.0)))
     yield Fact("Since when", say("report.date", t=since), (lasted,))
     faults, sized = status.newest_sizes
-    for one in faults if fault else ():
-        fact = size_fact(one)
+    for estimate in faults if fault else ():
+        fact = size_fact(estimate)
         yield fact._replace(lines=(*fact.lines, *((say("report.sized", t=sized),) if sized is not None else ())))
     if fault and diagnosis is not None and diagnosis.probability is not None and diagnosis.faults:
         yield Fact("How sure", format_probability(diagnosis.probability), (say("report.among_pairs"),))

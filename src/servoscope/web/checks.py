@@ -38,10 +38,10 @@ def asset_checks(context: Context, asset: str, status: AssetStatus, row: Row | N
     diagnosis = read_diagnosis(row["document"]) if row is not None else None
     names = [fault.name for fault in status.faults] or (suspects(diagnosis.current) if diagnosis is not None else ())
     loop = asset_loop(context, asset)
-    found = fault_checks(context, asset, loop, names)
-    if not any(check.texts for check in found) and diagnosis is not None:  # its baseline is not here any more
+    checks = fault_checks(context, asset, loop, names)
+    if not any(check.texts for check in checks) and diagnosis is not None:  # its baseline is not here any more
         return [FaultCheck(fault="", label="", texts=[str(text) for text in diagnosis.checks])]
-    return found
+    return checks
 
 
 def fault_checks(context: Context, asset: str, loop: Loop | None, names: Iterable[str]) -> list[FaultCheck]:

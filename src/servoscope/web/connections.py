@@ -46,7 +46,7 @@ class ConnectionTable:
 
     def begin_handshake(self, connection: socket.socket, client: tuple[str, int]) -> None:
         """Count a connection that has to agree on TLS first; where there are too many, the oldest gives way."""
-        self._handshakes = {key: one for key, one in self._handshakes.items() if one.fileno() >= 0}
+        self._handshakes = {key: handshake for key, handshake in self._handshakes.items() if handshake.fileno() >= 0}
         own = [key for key in self._handshakes if key[0] == client[0] and not is_member(key[0], self._proxies)]
         everybody = list(self._handshakes)
         for some, most in ((own, self._most_per_address), (everybody, self._most - len(self._hosts))):
@@ -88,7 +88,7 @@ class ConnectionTable:
             self._waiting.setdefault(connection)
 
     def _close_oldest(self, host: str | None) -> bool:
-        oldest = next((one for one in self._waiting if host is None or self._hosts[one] == host), None)
+        oldest = next((protocol for protocol in self._waiting if host is None or self._hosts[protocol] == host), None)
         if oldest is None:
             return False
         self.remove(oldest)

@@ -41,8 +41,8 @@ class LoginStates:
         body, _, signature = text.partition(".")
         if not hmac.compare_digest(signature.encode(), self._sign(body).encode()):
             return None
-        found = LoginState(**json.loads(urlsafe_b64decode(body)))
-        return found if now < found.expires else None
+        login_state = LoginState(**json.loads(urlsafe_b64decode(body)))
+        return login_state if now < login_state.expires else None
 
     def _sign(self, body: str) -> str:
         return hmac.new(self._key, body.encode(), hashlib.sha256).hexdigest()

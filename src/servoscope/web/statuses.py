@@ -33,9 +33,13 @@ def read_statuses(store: Store, names: Sequence[str] | None = None) -> dict[str,
 
 def asset_statuses(stored: Iterable[StatusEntry]) -> Iterator[tuple[StatusEntry, AssetStatus]]:
     """Yield those of assets."""
-    return ((one, one.status) for one in stored if isinstance(one.status, AssetStatus))
+    return (
+        (status_entry, status_entry.status) for status_entry in stored if isinstance(status_entry.status, AssetStatus)
+    )
 
 
 def service_statuses(stored: Iterable[StatusEntry]) -> Iterator[tuple[StatusEntry, ServiceStatus]]:
     """Yield those of services."""
-    return ((one, one.status) for one in stored if isinstance(one.status, ServiceStatus))
+    return (
+        (status_entry, status_entry.status) for status_entry in stored if isinstance(status_entry.status, ServiceStatus)
+    )

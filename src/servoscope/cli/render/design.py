@@ -59,7 +59,7 @@ def _doubts(name: str, side: DirectionStudy) -> Iterator[str]:
 
 def _print_sizes(out: Console, s: DesignStudy) -> None:
     first = next(iter(s.faults.values()))
-    header = ("std. dev. of a size after", *(format_duration(each.seconds) for each in first.sizes))
-    rows = [(fault.name, *(design_page.format_std(each.std) for each in fault.sizes)) for fault in s.faults.values()]
+    header = ("std. dev. of a size after", *(format_duration(size.seconds) for size in first.sizes))
+    rows = [(fault.name, *(design_page.format_std(size.std) for size in fault.sizes)) for fault in s.faults.values()]
     print_table(out, header, rows)
     out.print()

@@ -42,11 +42,11 @@ def print_fleet(out: Console, f: Fleet) -> None:
             what = (f"{cause.key} {cause.group}", f"{len(cause.members)}", f"{cause.parameter} x {size}")
             rows.append((*what, f"{low} to {high}", since or DASH, format_probability(cause.probability)))
         print_table(out, ("common cause", "assets", "change", "95 %", "since", "probability"), rows)
-    ill = [one for one in f.assets if one.state not in ("healthy", "failed")]
+    ill = [asset for asset in f.assets if asset.state not in ("healthy", "failed")]
     if ill:
         own = [
-            (one.asset, one.day, one.state, format_probability(one.probability), one.said)
-            for one in ill[:MAX_ASSETS_SHOWN]
+            (summary.asset, summary.day, summary.state, format_probability(summary.probability), summary.said)
+            for summary in ill[:MAX_ASSETS_SHOWN]
         ]
         print_table(out, ("asset", "day", "state", "own", ""), own, words=5)
     if len(ill) > MAX_ASSETS_SHOWN:

@@ -115,7 +115,7 @@ def status_page(statuses: Mapping[str, Mapping[str, Any]], width: int) -> Group:
 
 def format_alarms(alarms: Mapping[str, Mapping[str, Any]]) -> str:
     """Return the alarms that are not normal."""
-    states = {name: one["state"] for name, one in alarms.items() if one["state"] != "normal"}
+    states = {name: alarm["state"] for name, alarm in alarms.items() if alarm["state"] != "normal"}
     return ", ".join(f"{translate(name)} {translate(plain_name(state))}" for name, state in states.items()) or DASH
 
 

@@ -65,7 +65,7 @@ PLAIN_TEXT = "text"  # the key of a message that is its text: from outside, or o
 @functools.cache
 def languages() -> tuple[str, ...]:
     """Return the languages that there is a catalogue of."""
-    names = sorted(each.name for each in FOLDER.iterdir() if each.name.endswith(".toml"))
+    names = sorted(traversable.name for traversable in FOLDER.iterdir() if traversable.name.endswith(".toml"))
     return tuple(name.removesuffix(".toml") for name in names)
 
 

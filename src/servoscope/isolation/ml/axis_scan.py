@@ -54,8 +54,8 @@ def find_axis_change(baseline: Baseline, recording: Recording) -> AxisChange | N
     limit = max(scan_limit(len(faults)), model.change_limit)
     enough = max(scan_limit(BANDS), model.change_limit, model.vibration_limit)
     for window in _stretches(baseline.loop, model, recording):
-        found = _likeliest_change(window, faults)
-        change = None if found is None else _named_change(window, found, limit, enough)
+        fit = _likeliest_change(window, faults)
+        change = None if fit is None else _named_change(window, fit, limit, enough)
         if change is not None:
             return change
     return None
@@ -85,11 +85,11 @@ def largest_changes(loop: Loop, model: AxisModel, recording: Recording) -> tuple
     faults = model.visible_faults(loop.plant.faults)
     gains, shaken = [0.0], [0.0]
     for window in _stretches(loop, model, recording):
-        found = _likeliest_change(window, faults)
-        if found is not None:
-            gains.append(found.gain)
+        fit = _likeliest_change(window, faults)
+        if fit is not None:
+            gains.append(fit.gain)
             vibration = find_vibration(
-                window, found.healthy.residual, scan_limit(BANDS) / HEALTHY_MARGIN, MIN_AMPLITUDE_RATIO / HEALTHY_MARGIN
+                window, fit.healthy.residual, scan_limit(BANDS) / HEALTHY_MARGIN, MIN_AMPLITUDE_RATIO / HEALTHY_MARGIN
             )
             shaken.append(0.0 if vibration is None else vibration.statistic)
     return max(gains), max(shaken)

@@ -112,7 +112,7 @@ def fit_hypothesis(
         if np.abs(z).max() < START_LOGARITHM:  # the first step is as long as the start, and as long as it likes from 0
             z = np.zeros_like(z)
         try:
-            found = minimise(
+            optimize_result = minimise(
                 residual,
                 z,
                 jacobian,
@@ -126,7 +126,7 @@ def fit_hypothesis(
             )
         except ValueError as error:  # residuals that are no numbers
             raise np.linalg.LinAlgError(str(error)) from None
-        ends.append(found)
+        ends.append(optimize_result)
     best = min(ends, key=lambda found: float(found.cost))
     z, J = whole(np.asarray(best.x)), np.asarray(best.jac, dtype=np.float64)
     H = J.T @ J

@@ -33,17 +33,18 @@ def find_other_causes(refined: RefitResult, since: ChangeProfile | None = None) 
     those as good as it, if they explain nearly all that the healthy plant does not.
     """
     window, best, causes = refined.window, refined.best.fitted, CauseWindow(refined.window)
-    found = _all_causes(refined, causes, since or best.profile)
+    other_cause = _all_causes(refined, causes, since or best.profile)
     limit = best.cost
     if refined.is_unknown:
         if since is None:  # the onset of an explanation that is none may mean nothing
             earlier = _all_causes(refined, causes, ChangeProfile(refined.initial_onset))
-            found = min(found, earlier, key=lambda each: min(cause.cost for cause in each))
+            other_cause = min(other_cause, earlier, key=lambda each: min(cause.cost for cause in each))
         most = window.samples + (1.0 - MIN_EXPLAINED_SHARE) * (causes.healthy_cost - window.samples)
         enough = min(max(most, MAX_WHITE_VARIANCE * window.samples), best.cost)
-        limit = min([cause.cost for cause in found if enough >= cause.cost], default=-np.inf)
+        limit = min([cause.cost for cause in other_cause if enough >= cause.cost], default=-np.inf)
     return sorted(
-        (c for c in found if limit + FIT_TOLERANCE * refined.noise_variance >= c.cost), key=lambda cause: cause.cost
+        (c for c in other_cause if limit + FIT_TOLERANCE * refined.noise_variance >= c.cost),
+        key=lambda cause: cause.cost,
     )
 
 
@@ -61,13 +62,13 @@ def find_outside_onset(refined: RefitResult) -> OnsetEstimate | None:
     cause, onset = min(tried, key=lambda one: one[0].cost)
     parameter = min(refined.other_parameters, key=lambda fitted: fitted.cost, default=None)
     if parameter is not None and parameter.cost < cause.cost:
-        found, cause = _parameter_onset(window, parameter, refined.latest)
+        estimate, cause = _parameter_onset(window, parameter, refined.latest)
     else:
-        found, cause = _disturbance_onset(causes, cause, onset, refined.latest)
+        estimate, cause = _disturbance_onset(causes, cause, onset, refined.latest)
     variance = cause.cost / window.used
     e = cause.residual[: window.samples]
     quiet = variance <= MAX_WHITE_VARIANCE and bridge_height(e**2 / variance - 1.0) <= MAX_BRIDGE
-    return found if quiet and cause.cost + MAX_EXCESS_SQUARES * variance < refined.best.fitted.cost else None
+    return estimate if quiet and cause.cost + MAX_EXCESS_SQUARES * variance < refined.best.fitted.cost else None
 
 
 def _all_causes(refined: RefitResult, causes: CauseWindow, profile: ChangeProfile) -> list[OtherCause]:
@@ -81,11 +82,11 @@ def _all_causes(refined: RefitResult, causes: CauseWindow, profile: ChangeProfil
 def _parameter_onset(window: ChangeWindow, fitted: HypothesisFit, latest: int) -> tuple[OnsetEstimate, OtherCause]:
     """Find onset and size of a parameter in turns."""
     for _ in range(MAX_LOOKS):
-        found = onset_posterior(window, fitted, latest, fitted.cost / window.used, drifts=False)
-        if found.profile == fitted.profile:
+        estimate = onset_posterior(window, fitted, latest, fitted.cost / window.used, drifts=False)
+        if estimate.profile == fitted.profile:
             break
-        fitted = refit_jointly(window, replace(fitted, profile=found.profile))
-    return found, parameter_cause(fitted)
+        fitted = refit_jointly(window, replace(fitted, profile=estimate.profile))
+    return estimate, parameter_cause(fitted)
 
 
 def _disturbance_onset(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, product
+from itertools import combinations
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from servoscope.isolation.ml.hypothesis import (
     refit_jointly,
 )
 from servoscope.isolation.ml.onset import OnsetEstimate, onset_posterior
-from servoscope.isolation.ml.start_values import SizeGrid, fit_further_parameters, pair_start_values
+from servoscope.isolation.ml.start_values import SizeGrid, choose_start, fit_further_parameters, pair_start_values
 from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow, RefitWindow
 from servoscope.models.plants import Fault
 from servoscope.signals import Recording
@@ -240,7 +240,7 @@ class _HypothesisSearch:
         The recursion's onset may be far off where a fault moves its coefficients along a curve, as oil does; the alarm
         is never far behind. Sizes that fit a wrong onset may be stuck: a grid over all sizes is searched each time.
         """
-        d, grids, begin = self._choose_start(d)
+        d, grids, begin = choose_start(self.window, self.faults, d, {self.initial_onset, self.latest})
         singles = self._fit_each_fault(ChangeProfile(begin), d, grids)
         for drifts in (False, True):
             for _ in range(MAX_LOOKS):
@@ -253,23 +253,6 @@ class _HypothesisSearch:
                 if gained < MIN_LOOK_GAIN * self.noise_variance:
                     break
         return found, singles
-
-    def _choose_start(self, d: FloatArray) -> tuple[FloatArray, list[SizeGrid], int]:
-        """Return healthy parameters, a grid per fault, and an onset: where all of them together cost least.
-
-        Healthy parameters that follow may have taken over a fault that was there from the first sample on.
-        """
-        healthy, onsets = [d], {self.initial_onset, self.latest}
-        if self.window.follows:
-            healthy, onsets = [d, np.zeros_like(d)], {0, *onsets}
-        starts = [(z, [SizeGrid.from_window(self.window, fault, z) for fault in self.faults]) for z in healthy]
-
-        def cost(start: tuple[FloatArray, list[SizeGrid]], onset: int) -> float:
-            prior, profile = self.window.prior @ start[0], ChangeProfile(onset)
-            return float(min(grid.sums_of_squares(self.window, profile).min() for grid in start[1]) + prior @ prior)
-
-        (d, grids), begin = min(product(starts, sorted(onsets)), key=lambda choice: cost(*choice))
-        return d, grids, begin
 
     def _fit_each_fault(
         self, profile: ChangeProfile, d: FloatArray, grids: Sequence[SizeGrid], known: Sequence[HypothesisFit] = ()

@@ -112,13 +112,15 @@ class _TimelineSearch:
         plants = [ChangedPlant((fault,), np.array([x])) for fault, grid in grids for x in grid.sizes]
         best = self._sequence([HEALTHY, change, *plants])
         for _ in range(MAX_ROUNDS):
-            known = {id(one): one for one in best.plants if one.faults}
+            known = {id(plant): plant for plant in best.plants if plant.faults}
             fitted = list(self._fit_stretches(best))
-            sequence = self._sequence([HEALTHY, *known.values(), *(one for _, each in fitted for one in each)])
-            found = min(sequence, self._place([(k, each[0]) for k, each in fitted]), key=lambda one: one.cost)
-            if found.cost > best.cost - MIN_ROUND_GAIN:
+            sequence = self._sequence([HEALTHY, *known.values(), *(plant for _, plants in fitted for plant in plants)])
+            plant_sequence = min(
+                sequence, self._place([(k, plants[0]) for k, plants in fitted]), key=lambda one: one.cost
+            )
+            if plant_sequence.cost > best.cost - MIN_ROUND_GAIN:
                 break
-            best = found
+            best = plant_sequence
         if (
             best.cost > self._cost_of(single) + _price(change)
             or best.likelihood > MAX_WHITE_VARIANCE * self.window.samples
@@ -147,8 +149,8 @@ class _TimelineSearch:
 
     def _place(self, stretches: Sequence[tuple[int, ChangedPlant]]) -> PlantSequence:
         """Return a sequence whose changes are where they are likeliest; neighbours that are the same become one."""
-        kept = [(k, one) for i, (k, one) in enumerate(stretches) if not i or one is not stretches[i - 1][1]]
-        starts, plants = [k for k, _ in kept], [one for _, one in kept]
+        kept = [(k, plant) for i, (k, plant) in enumerate(stretches) if not i or plant is not stretches[i - 1][1]]
+        starts, plants = [k for k, _ in kept], [plant for _, plant in kept]
         cost = SequenceCost(self.window, self.window.healthy, [*map(self._predictor, plants)])
         bounds = [*starts, self.window.samples]
 
@@ -172,9 +174,9 @@ class _TimelineSearch:
             others = [HEALTHY, *found.plants[max(i - 1, 0) : i], *found.plants[i + 1 : i + 2]]
             without = min(
                 (
-                    self._place([*zip(found.starts, [*found.plants[:i], one, *found.plants[i + 1 :]], strict=True)])
-                    for one in others
-                    if one is not plant
+                    self._place([*zip(found.starts, [*found.plants[:i], other, *found.plants[i + 1 :]], strict=True)])
+                    for other in others
+                    if other is not plant
                 ),
                 key=lambda one: one.cost,
             )
@@ -198,16 +200,16 @@ class _TimelineSearch:
                 fit_hypothesis(part, [fault], FROM_START, self.known, grid.local_minima(part, FROM_START), free=False)
                 for fault, grid in zip(self.faults, self.grids, strict=True)
             ]
-            if min(one.cost for one in fitted) > part.samples + SWITCH_PRICE:
+            if min(fit.cost for fit in fitted) > part.samples + SWITCH_PRICE:
                 fitted += list(self._fit_pairs(part, fitted))
             ranked = sorted([healthy, *fitted], key=lambda one: one.cost + SIZE_PRICE * len(one.x))
-            yield begin, [ChangedPlant(one.faults, one.x) if one.faults else HEALTHY for one in ranked]
+            yield begin, [ChangedPlant(fit.faults, fit.x) if fit.faults else HEALTHY for fit in ranked]
 
     def _fit_pairs(self, part: RefitWindow, singles: Sequence[HypothesisFit]) -> Iterator[HypothesisFit]:
-        for one, other in combinations(singles, 2):
+        for fit, other in combinations(singles, 2):
             self.progress()
-            starts = [np.append(one.x, 0.0), np.append(0.0, other.x)]
-            yield fit_hypothesis(part, [*one.faults, *other.faults], FROM_START, self.known, starts, free=False)
+            starts = [np.append(fit.x, 0.0), np.append(0.0, other.x)]
+            yield fit_hypothesis(part, [*fit.faults, *other.faults], FROM_START, self.known, starts, free=False)
 
     def _explain(self, bounds: Sequence[int], each: Sequence[ChangedPlant]) -> Iterator[TimelineStretch]:
         begins = [(0, 0, 0)]
@@ -238,8 +240,8 @@ class _TimelineSearch:
         near = replace(window, plant=plant, prior=prior).cut(first, end)
         wide = [replace(fault, ratio_range=(1e-3, 1e3)) for fault in faults]
         fitted = fit_hypothesis(near, wide, ChangeProfile(change - first), self.known, [steps], free=True)
-        found = onset_posterior(near, fitted, near.samples - 1, fitted.cost / near.samples, drifts=False)
-        low, likely, high = (first + k for k in (found.low, found.profile.onset, found.high))
+        estimate = onset_posterior(near, fitted, near.samples - 1, fitted.cost / near.samples, drifts=False)
+        low, likely, high = (first + k for k in (estimate.low, estimate.profile.onset, estimate.high))
         return low, likely, high
 
 

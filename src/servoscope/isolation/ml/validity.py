@@ -56,5 +56,5 @@ def _misfit(window: RefitWindow) -> float:
     jacobian = window.jacobian(nothing, (), always)
     noise_variance = float(residual @ residual) / window.samples
     Z = misspecification_columns(window, window.healthy, always, np.ones(window.samples, dtype=np.bool_))
-    found = score_test(Z, jacobian, residual, noise_variance, 0.0)
-    return found.statistic / found.limit
+    goodness_of_fit = score_test(Z, jacobian, residual, noise_variance, 0.0)
+    return goodness_of_fit.statistic / goodness_of_fit.limit

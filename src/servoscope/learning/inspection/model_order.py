@@ -148,7 +148,7 @@ def select_order(g: Regressors, used: BoolArray, block: int) -> tuple[tuple[Mode
             return None
         return ModelOrderFit(order=order, friction=friction, stiffness=stiffness, explained=fitted.explained)
 
-    tried = [found for order in (1, 2, 3) if (found := attempt(order, "none", True)) is not None]
+    tried = [fit for order in (1, 2, 3) if (fit := attempt(order, "none", True)) is not None]
     if not tried:
         return (), None
     best = tried[0]

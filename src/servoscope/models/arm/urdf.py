@@ -58,7 +58,7 @@ def parse_urdf(text: str, source: str) -> Kinematics:
         raise LoopError(f"{source}: is not XML ({error})") from None
     if root.tag != "robot":
         raise LoopError(f"{source}: is no URDF, its root is {root.tag!r} instead of 'robot'")
-    if "${" in text or any(isinstance(each.tag, str) and "wiki/xacro" in each.tag for each in root.iter()):
+    if "${" in text or any(isinstance(element.tag, str) and "wiki/xacro" in element.tag for element in root.iter()):
         raise LoopError(f"{source}: is xacro, make a URDF of it first: xacro {Path(source).name} > arm.urdf")
     try:
         return _Tree(root).kinematics()

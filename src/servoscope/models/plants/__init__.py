@@ -34,10 +34,12 @@ ENTRY_POINTS = "servoscope.plants"  # of other packages: name is the kind, objec
 
 @functools.cache
 def _built_in() -> dict[str, type[Plant]]:
-    modules = [importlib.import_module(f"{__name__}.{found.name}") for found in pkgutil.iter_modules(__path__)]
+    modules = [
+        importlib.import_module(f"{__name__}.{module_info.name}") for module_info in pkgutil.iter_modules(__path__)
+    ]
     classes = {each for module in modules for each in vars(module).values() if isinstance(each, type)}
     plants = [each for each in classes if issubclass(each, Plant) and not inspect.isabstract(each)]
-    return {str(each.model_fields["kind"].default): each for each in plants}
+    return {str(plant.model_fields["kind"].default): plant for plant in plants}
 
 
 def plant_kinds() -> list[str]:
@@ -52,11 +54,11 @@ def plant_class(kind: object) -> type[Plant]:
     """
     if isinstance(kind, str) and kind in _built_in():
         return _built_in()[kind]
-    found = next((each for each in entry_points(group=ENTRY_POINTS) if each.name == kind), None)
-    if found is None:
+    point = next((point for point in entry_points(group=ENTRY_POINTS) if point.name == kind), None)
+    if point is None:
         raise LoopError(f"[plant] kind = {kind!r}: unknown, choose from {', '.join(plant_kinds())}")
     try:
-        loaded: type[Plant] = found.load()
+        loaded: type[Plant] = point.load()
     except Exception as error:  # whatever another package raises
         raise LoopError(f"[plant] kind = {kind!r}: its package is broken, repair or remove it ({error})") from error
     return loaded

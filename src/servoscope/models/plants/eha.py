@@ -140,14 +140,14 @@ class EHA(Plant):
 
     def state_spaces(self, factors: Mapping[str, Any], count: int) -> StateSpace:
         """Return those of so many actuators at once: their parameters are arrays."""
-        one = self.scaled(factors)
-        m_p, capacity = one.m_p, one.capacity
+        eha = self.scaled(factors)
+        m_p, capacity = eha.m_p, eha.capacity
         A = [
             [0.0, 1.0, 0.0],
-            [-one.k_p / m_p, -one.b_p / m_p, one.A_p / m_p],
-            [0.0, -one.A_p / capacity, -(one.C_ie + one.K_c) / capacity],
+            [-eha.k_p / m_p, -eha.b_p / m_p, eha.A_p / m_p],
+            [0.0, -eha.A_p / capacity, -(eha.C_ie + eha.K_c) / capacity],
         ]
-        B = [[0.0], [0.0], [one.input_gain * one.flow_gain / capacity]]
+        B = [[0.0], [0.0], [eha.input_gain * eha.flow_gain / capacity]]
         return matrices(A, count), matrices(B, count), matrices([[1.0, 0.0, 0.0]], count)
 
     def frequency_response(self, f_hz: npt.ArrayLike) -> npt.NDArray[np.complex128]:

@@ -54,10 +54,10 @@ def evaluate_claims(metrics: MetricSamples) -> list[Claim]:
     texts = tomllib.loads(files(__package__).joinpath("claims.toml").read_text(encoding="utf-8"))
     for name, text in texts.items():
         numbers = MetricQuartiles(metrics)
-        found = RULES[name](numbers)
-        why = text["why"] if found.cause_confirmed else text["why_otherwise"]
-        measured = numbers.fill(text["measured"], found.counts)
-        verdict = "holds" if found.holds else "holds partly" if found.partly else "does not hold"
+        judgement = RULES[name](numbers)
+        why = text["why"] if judgement.cause_confirmed else text["why_otherwise"]
+        measured = numbers.fill(text["measured"], judgement.counts)
+        verdict = "holds" if judgement.holds else "holds partly" if judgement.partly else "does not hold"
         made.append(Claim(name, text["place"], text["claim"], measured, verdict, why, dict(numbers.used)))
     return made
 

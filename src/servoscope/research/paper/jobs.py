@@ -41,7 +41,7 @@ def run_job(job: SeedJob) -> dict[str, float]:
         return noise_free_metrics()
     if job.part in PARTS:
         return PARTS[job.part](job.seed)
-    conditions = next(each for each in tradeoff.CONDITIONS if str(each) == job.part)
+    conditions = next(conditions for conditions in tradeoff.CONDITIONS if str(conditions) == job.part)
     flat = tradeoff.trade_off_metrics(conditions, job.seed)
     for other in tradeoff.ESTIMATORS[1:]:
         for column in tradeoff.COLUMNS[1:]:

@@ -57,7 +57,7 @@ def reschedule_gains(loop: Loop, plant: Plant) -> Controller:
     k_i = integrating * loop.sample_rate
     r = PAPER.reference_signal()[:1000]
     wanted = simulate_response(loop, r)[1]
-    best, found = np.inf, Controller(kind="pi", k_p=k_p, k_i=k_i)
+    best, controller = np.inf, Controller(kind="pi", k_p=k_p, k_i=k_i)
     for gain in GAINS:
         for integral in INTEGRALS:
             tried = Controller(kind="pi", k_p=k_p * gain, k_i=k_i * integral * gain)
@@ -66,8 +66,8 @@ def reschedule_gains(loop: Loop, plant: Plant) -> Controller:
                 continue
             error = float(np.mean((wanted - simulate_response(with_it, r)[1]) ** 2))
             if error < best:
-                best, found = error, tried
-    return found
+                best, controller = error, tried
+    return controller
 
 
 def simulate_gain_change(

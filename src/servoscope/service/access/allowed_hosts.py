@@ -67,8 +67,8 @@ class AllowedHosts:
 
 def _parse_origin(url: str) -> tuple[str, str | None, int | None]:
     try:
-        found = urlsplit(url)
-        name = found.hostname.rstrip(".") if found.hostname else None
-        return found.scheme, name, found.port or DEFAULT_PORTS.get(found.scheme)
+        split_result = urlsplit(url)
+        name = split_result.hostname.rstrip(".") if split_result.hostname else None
+        return split_result.scheme, name, split_result.port or DEFAULT_PORTS.get(split_result.scheme)
     except ValueError:
         return "", None, None

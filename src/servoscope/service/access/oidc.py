@@ -64,5 +64,5 @@ class OidcSettings(SecretSettings):
         for key in (self.role_claim,) if self.role_claim in claims else self.role_claim.split("."):
             value = value.get(key) if isinstance(value, Mapping) else None
         texts = [value] if isinstance(value, str) else value if isinstance(value, list) else []
-        held = {one for one in texts if isinstance(one, str)}
+        held = {text for text in texts if isinstance(text, str)}
         return next((role for role in reversed(ROLES) if held & set(self.roles.get(role, ()))), None)

@@ -34,7 +34,7 @@ class Sessions:
 
     def begin(self, user: str, stamp: str, now: float, role: Role | None = None) -> tuple[str, Session]:
         """Return the secret of a new session, and the session; `now` is by the monotonic clock [s]."""
-        self._of = {key: one for key, one in self._of.items() if one.expires > now}
+        self._of = {key: session for key, session in self._of.items() if session.expires > now}
         while len(self._of) >= MAX_ENTRIES:
             del self._of[next(iter(self._of))]
         secret = secrets.token_urlsafe(32)
@@ -44,8 +44,8 @@ class Sessions:
 
     def find(self, secret: str | None, now: float) -> Session | None:
         """Return a session that is still good."""
-        found = self._of.get(_digest(secret)) if secret else None
-        return found if found is not None and found.expires > now else None
+        session = self._of.get(_digest(secret)) if secret else None
+        return session if session is not None and session.expires > now else None
 
     def end(self, secret: str | None) -> None:
         """Delete a session."""

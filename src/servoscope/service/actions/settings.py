@@ -200,15 +200,24 @@ class ActionSettings(Settings):
         twice = [name for name, count in Counter(chain(*(getattr(self, key) for key in SINKS))).items() if count > 1]
         if twice:
             raise ValueError(f"{min(twice)!r} names two of {SINK_NAMES}, rename one")
-        for name, one in self.tolerance.items():
-            if one.sink is not None and (one.sink in self.email or one.sink not in self.sinks):
-                raise ValueError(f"tolerance.{name}: sink: no webhook, command or mqtt is called {one.sink!r}")
+        for name, fault_tolerance_settings in self.tolerance.items():
+            if fault_tolerance_settings.sink is not None and (
+                fault_tolerance_settings.sink in self.email or fault_tolerance_settings.sink not in self.sinks
+            ):
+                raise ValueError(
+                    f"tolerance.{name}: sink: no webhook, command or mqtt is called {fault_tolerance_settings.sink!r}"
+                )
         return self
 
     def with_network(self, network: NetworkSettings) -> ActionSettings:
         """Return the same with rules for those that have none of their own."""
-        brokers = apply_network({name: one.broker for name, one in self.mqtt.items()}, network)
-        mqtt = {name: one.model_copy(update={"broker": brokers[name]}) for name, one in self.mqtt.items()}
+        brokers = apply_network(
+            {name: mqtt_message_settings.broker for name, mqtt_message_settings in self.mqtt.items()}, network
+        )
+        mqtt = {
+            name: mqtt_message_settings.model_copy(update={"broker": brokers[name]})
+            for name, mqtt_message_settings in self.mqtt.items()
+        }
         webhook, email = apply_network(self.webhook, network), apply_network(self.email, network)
         return self.model_copy(update={"webhook": webhook, "mqtt": mqtt, "email": email})
 
@@ -217,10 +226,12 @@ class ActionSettings(Settings):
 
         def renamed(sinks: dict[str, Any]) -> dict[str, Any]:
             return {
-                key: one.model_copy(update={"assets": tuple(name if each == before else each for each in one.assets)})
-                if one.assets
-                else one
-                for key, one in sinks.items()
+                key: sink.model_copy(
+                    update={"assets": tuple(name if asset == before else asset for asset in sink.assets)}
+                )
+                if sink.assets
+                else sink
+                for key, sink in sinks.items()
             }
 
         return self.model_copy(update={key: renamed(getattr(self, key)) for key in SINKS})
@@ -228,7 +239,7 @@ class ActionSettings(Settings):
     @property
     def executing(self) -> set[str | None]:
         """Names of the sinks that change a machine, and are not tried therefore."""
-        return {one.sink for one in self.tolerance.values()}
+        return {fault_tolerance_settings.sink for fault_tolerance_settings in self.tolerance.values()}
 
     @property
     def sinks(self) -> dict[str, Sink]:

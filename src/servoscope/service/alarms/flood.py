@@ -64,7 +64,11 @@ def notify_transition(
             notices += (Notification("flood_begins", transition.time, counted=counted, peak=state.peak),)
     # each transition looks through all that is held, thousands in a flood: not by `key`, which takes ten times as long
     asset, alarm = transition.asset, transition.alarm
-    places = [k for k, one in enumerate(state.held) if one.transition.asset == asset and one.transition.alarm == alarm]
+    places = [
+        k
+        for k, held_alarm in enumerate(state.held)
+        if held_alarm.transition.asset == asset and held_alarm.transition.alarm == alarm
+    ]
     before = state.held[places[0]] if places else None
     low = PRIORITIES.index(priority) < PRIORITIES.index(settings.announced_from)
     waits = transition.is_new or (before is not None and transition.after in UNACKNOWLEDGED_STATES)
@@ -74,7 +78,7 @@ def notify_transition(
         return replace(state, held=(*state.held[:k], held, *state.held[k + 1 :])), notices
     # Somebody has dealt with a held alarm, or its priority is high now: it is not announced once more at the end.
     if before is not None:
-        state = replace(state, held=tuple(one for one in state.held if one is not before))
+        state = replace(state, held=tuple(alarm for alarm in state.held if alarm is not before))
     kind: Literal["alarm", "change"] = "alarm" if transition.is_new else "change"
     return state, (*notices, Notification(kind, transition.time, transition, priority))
 
@@ -92,5 +96,5 @@ def advance_flood(
     if len(recent) >= settings.ends_below:
         return replace(state, recent=recent), ()
     end = Notification("flood_ends", time, counted=state.counted, peak=state.peak)
-    held = (Notification("held", time, one.transition, one.priority, one.count) for one in state.held)
+    held = (Notification("held", time, alarm.transition, alarm.priority, alarm.count) for alarm in state.held)
     return FloodState(recent), (end, *held)

@@ -77,14 +77,14 @@ def advance_alarms(
 
     An alarm that suppresses others comes before them there, so that both happen at the same moment.
     """
-    new, found = dict(states), list[AlarmTransition]()
+    new, alarm_transition = dict(states), list[AlarmTransition]()
     for name, definition in definitions.items():
-        active = tuple(other for other, one in new.items() if one.active)
+        active = tuple(other for other, alarm_state in new.items() if alarm_state.active)
         if update is not None and update.alarms != active:
             update = replace(update, alarms=active)
         new[name], transitions = step_alarm(definition, new[name], update, time)
-        found += transitions
-    return new, tuple(sorted(found, key=lambda one: one.time))
+        alarm_transition += transitions
+    return new, tuple(sorted(alarm_transition, key=lambda one: one.time))
 
 
 def next_event_time(definitions: Mapping[str, AlarmDefinition], states: Mapping[str, AlarmState]) -> float:
@@ -213,11 +213,11 @@ def evaluate_ne107(
     found: list[tuple[Ne107, str]] = [(NE107_OF_QUALITY[kind], kind) for kind in quality]
     if verdict in NE107_OF_VERDICT:
         found.append((NE107_OF_VERDICT[verdict], verdict))
-    for definition, one in alarms:
-        if one.state is LifecycleState.OUT_OF_SERVICE:
-            found.append(("function_check", render(message("alarm.out_of_service", alarm=one.alarm))))
-        elif not one.suppressed and (one.active or one.state in LATCHED_STATES):
-            found.append((definition.ne107, one.alarm))
+    for definition, alarm_state in alarms:
+        if alarm_state.state is LifecycleState.OUT_OF_SERVICE:
+            found.append(("function_check", render(message("alarm.out_of_service", alarm=alarm_state.alarm))))
+        elif not alarm_state.suppressed and (alarm_state.active or alarm_state.state in LATCHED_STATES):
+            found.append((definition.ne107, alarm_state.alarm))
     worst: Ne107 = max((status for status, _ in found), key=SEVERITY.index, default="good")
     reasons = (reason for status, reason in found if status == worst and worst != "good")
     return Ne107Status(worst, tuple(dict.fromkeys(reasons)))

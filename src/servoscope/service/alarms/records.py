@@ -141,7 +141,7 @@ class PersistentState(JsonRecord):
             raise StateError(
                 f"{what} of version {version!r}, this servoscope reads {cls.VERSION}: use that which wrote it"
             )
-        if set(plain) != {each.name for each in fields(cls)} | {"version"}:  # type: ignore[arg-type]
+        if set(plain) != {field.name for field in fields(cls)} | {"version"}:  # type: ignore[arg-type]
             raise StateError(f"{what} is not whole: restore it from a copy, or remove it to begin anew")
         try:
             return super().from_dict({key: value for key, value in plain.items() if key != "version"})

@@ -167,14 +167,22 @@ class AlarmSettings(Settings):
     @property
     def asset_alarms(self) -> dict[str, AlarmDefinition]:
         """The alarms that each asset has, by name."""
-        found = [(n, one) for n, one in self.definitions.items() if one.enabled and one.source not in SERVICE_SOURCES]
+        found = [
+            (n, definition)
+            for n, definition in self.definitions.items()
+            if definition.enabled and definition.source not in SERVICE_SOURCES
+        ]
         # What suppresses comes before what is suppressed, so that both happen in the same step.
         return dict(sorted(found, key=lambda item: bool(item[1].suppressed_when)))
 
     @property
     def service_alarms(self) -> dict[str, AlarmDefinition]:
         """The alarms that the service has of itself, by name; each connection has one."""
-        return {name: one for name, one in self.definitions.items() if one.enabled and one.source in SERVICE_SOURCES}
+        return {
+            name: definition
+            for name, definition in self.definitions.items()
+            if definition.enabled and definition.source in SERVICE_SOURCES
+        }
 
     def find(self, alarm: str) -> AlarmDefinition:
         """Return the definition of an alarm."""

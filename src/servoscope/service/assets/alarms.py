@@ -41,12 +41,12 @@ class AssetAlarms:
 
     def __init__(self, settings: AlarmSettings, ahead_s: float, *, limited: bool) -> None:
         alarms = settings.asset_alarms.items()
-        self.definitions = {key: one for key, one in alarms if limited or one.source != "outlook"}
-        self.assesses = any(one.source == "control" for one in self.definitions.values())
+        self.definitions = {key: definition for key, definition in alarms if limited or definition.source != "outlook"}
+        self.assesses = any(definition.source == "control" for definition in self.definitions.values())
         self._ahead_s = ahead_s
         self.announced: Announcement | None = None
         self._settled: AlarmStandstill | None = None
-        self._by_numbers = any(one.source in ("statistic", "level") for one in self.definitions.values())
+        self._by_numbers = any(definition.source in ("statistic", "level") for definition in self.definitions.values())
 
     def begin(self, asset: str, t: float, before: Mapping[str, AlarmState]) -> dict[str, AlarmState]:
         """Return the states at `t` [UTC s] of alarms that go on as `before`, or of which nothing is known."""
@@ -71,9 +71,9 @@ class AssetAlarms:
     def standing(self, alarms: Mapping[str, AlarmState]) -> list[tuple[str, str, str]]:
         """Return name, priority and state of each of these alarms that is not normal."""
         return [
-            (name, self.definitions[name].priority, one.state.value)
-            for name, one in alarms.items()
-            if one.state is not LifecycleState.NORMAL
+            (name, self.definitions[name].priority, alarm.state.value)
+            for name, alarm in alarms.items()
+            if alarm.state is not LifecycleState.NORMAL
         ]
 
     def execute(

@@ -139,19 +139,19 @@ class Asset(StateHolder):
         alarms = self._alarms.begin(self.name, t, state.alarms)
         self.state = replace(state, alarms=alarms, quality=quality.restart_silence(state.quality, t))
         position, blocks = state.position, list(stored)
-        counted = [one for one in blocks if one.sequence < position.blocks]
+        counted = [block for block in blocks if block.sequence < position.blocks]
         self._window = RecentBlocks(self.name, self.policy.diagnosis.kept_s, self._rate, counted)
         ahead = position.sequence - position.blocks + 1  # of the sender's numbers; all are of one stream
         return [
-            replace(one, sequence=one.sequence + ahead, stream=position.stream)
-            for one in blocks
-            if one.sequence >= position.blocks
+            replace(block, sequence=block.sequence + ahead, stream=position.stream)
+            for block in blocks
+            if block.sequence >= position.blocks
         ]
 
     def begin(self, position: StreamPosition) -> None:
         """Begin with a new state, before the first sample or behind those that were counted."""
         before = {} if self.heard or self.state is None else self.state.alarms_now
-        standing = {name: one for name, one in before.items() if one.sequence}
+        standing = {name: alarm_state for name, alarm_state in before.items() if alarm_state.sequence}
         self.state = AssetState(
             asset=self.name,
             baseline=self.baseline.hash,
@@ -314,7 +314,7 @@ class Asset(StateHolder):
         examination, diagnosis = accept_diagnosis(
             state.examination, window, diagnosis, first=self._is_first_diagnosis(window)
         )
-        pending = tuple(one for one in state.pending_diagnoses if one != window)
+        pending = tuple(pending_diagnose for pending_diagnose in state.pending_diagnoses if pending_diagnose != window)
         self.state = replace(state, examination=examination, pending_diagnoses=pending)
         values = {"number": window.number, "t": window.until, "grounds": window.why, **diagnosis.columns()}
         self._window.trim(self.take_state().position.t, self.take_state().pending_diagnoses)
@@ -396,5 +396,5 @@ class Asset(StateHolder):
 
     def _add_transitions(self, transitions: Sequence[AlarmTransition]) -> None:
         self._result.transitions.extend(transitions)
-        for one in transitions:
-            self._add_row("transitions", **transition_row(one, self._alarms.definitions[one.alarm]))
+        for transition in transitions:
+            self._add_row("transitions", **transition_row(transition, self._alarms.definitions[transition.alarm]))

@@ -89,7 +89,7 @@ class AssetState:
         """The alarms, each with the time of its last step."""
         if self.alarms_at is None:
             return self.alarms
-        return {name: evolve(one, at=self.alarms_at) for name, one in self.alarms.items()}
+        return {name: evolve(alarm, at=self.alarms_at) for name, alarm in self.alarms.items()}
 
 
 def pack_state(state: AssetState) -> bytes:

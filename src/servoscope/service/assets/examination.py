@@ -209,7 +209,7 @@ def carry_covariates(
         return blocks
     t, _, _, _, *rows = np.concatenate([block.signals for block in blocks], axis=1)
     filled = fill_channels(dict(zip(baseline.logged_covariates, rows, strict=True)), t - now, history)
-    columns = np.split(np.array(list(filled.values())), np.cumsum([one.t.size for one in blocks])[:-1], axis=1)
+    columns = np.split(np.array(list(filled.values())), np.cumsum([block.t.size for block in blocks])[:-1], axis=1)
     return [replace(block, covariates=own) for block, own in zip(blocks, columns, strict=True)]
 
 
@@ -231,5 +231,7 @@ def blocks_to_recording(baseline: Baseline, name: str, blocks: Sequence[Block]) 
     channels = {name: hold_last(c[:, None], c[~np.isnan(c)][:1])[:, 0] for name, c in told.items()}
     loop, start = baseline.loop, float(t[np.isfinite(t)][0]) if np.isfinite(t).any() else 0.0
     limits = loop.input_limits
-    found = clean(t - start, r, u, y, name=name, sample_rate=loop.sample_rate, limits=limits, channels=channels or None)
-    return found, start
+    recording = clean(
+        t - start, r, u, y, name=name, sample_rate=loop.sample_rate, limits=limits, channels=channels or None
+    )
+    return recording, start

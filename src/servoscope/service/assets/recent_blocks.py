@@ -30,8 +30,8 @@ class RecentBlocks:
         self._samples = 0
         for _, alike in groupby(blocks, key=lambda one: one.signals.shape):
             own = list(alike)
-            for one, packed in zip(own, pack_samples(np.stack([each.signals for each in own])), strict=True):
-                self.append((one.sequence, one.t.item(0), one.t.item(-1), one.t.size, *packed))
+            for block, packed in zip(own, pack_samples(np.stack([block.signals for block in own])), strict=True):
+                self.append((block.sequence, block.t.item(0), block.t.item(-1), block.t.size, *packed))
 
     def __len__(self) -> int:
         return len(self._blocks)
@@ -48,20 +48,24 @@ class RecentBlocks:
 
     def begins_with(self, t: float) -> bool:
         """Whether one of the blocks begins at `t` [UTC s]."""
-        return any(one[1] == t for one in self._blocks)
+        return any(block[1] == t for block in self._blocks)
 
     def after(self, t: float) -> list[Block]:
         """Return the blocks that end after `t` [UTC s]."""
-        return [self._unpack(one[0], *one[4:]) for one in self._blocks if one[2] > t]
+        return [self._unpack(block[0], *block[4:]) for block in self._blocks if block[2] > t]
 
     def within(self, pending: PendingDiagnosis) -> list[Block]:
         """Return the blocks that a full diagnosis looks at."""
-        found = (one for one in self._blocks if one[0] >= pending.first and one[1] < pending.until)
-        return [self._unpack(one[0], *one[4:]) for one in found]
+        generator = (block for block in self._blocks if block[0] >= pending.first and block[1] < pending.until)
+        return [self._unpack(one[0], *one[4:]) for one in generator]
 
     def trim(self, t: float, pending: Collection[PendingDiagnosis]) -> None:
         """Drop what is not needed at `t` [UTC s] any more; also where the clock was set back."""
-        first, begin, blocks = min(one.first for one in pending) if pending else None, t - self._span_s, self._blocks
+        first, begin, blocks = (
+            min(diagnosis.first for diagnosis in pending) if pending else None,
+            t - self._span_s,
+            self._blocks,
+        )
         while blocks and (first is None or blocks[0][0] < first):
             if blocks[0][2] > begin and self._samples <= self._most:
                 return

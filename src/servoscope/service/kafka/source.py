@@ -138,7 +138,7 @@ class KafkaTransport(ThreadTransport):
         committed: dict[tuple[str, int], int] = {}
         while not self._stop_event.is_set():
             with self._lock:
-                full = sum(len(one.open) for one in self._offsets.values()) >= self.settings.in_flight
+                full = sum(len(offset.open) for offset in self._offsets.values()) >= self.settings.in_flight
             if full:  # it must still be called, or the group takes it for dead
                 consumer.pause(consumer.assignment())
             for one in consumer.consume(AT_ONCE, FETCH_S):
@@ -162,8 +162,8 @@ class KafkaTransport(ThreadTransport):
 
     def _end_partitions(self, _consumer: Any, partitions: Any) -> None:
         with self._lock:  # what is not committed is sent to whom they belong to now
-            for one in partitions:
-                self._offsets.pop((one.topic, one.partition), None)
+            for partition in partitions:
+                self._offsets.pop((partition.topic, partition.partition), None)
 
     def _receive(self, one: Any) -> None:
         if one.error() is not None:
@@ -191,7 +191,7 @@ class KafkaTransport(ThreadTransport):
 
     def _commit(self, consumer: Any, committed: dict[tuple[str, int], int]) -> None:
         with self._lock:
-            now = {key: one.committable for key, one in self._offsets.items()}
+            now = {key: offset.committable for key, offset in self._offsets.items()}
         changed = {key: offset for key, offset in now.items() if committed.get(key) != offset and offset >= 0}
         if changed:
             offsets = [self._kafka.TopicPartition(*key, offset) for key, offset in changed.items()]

@@ -37,22 +37,22 @@ def parse_lines(message: bytes) -> list[dict[str, Any]]:
         raise MessageError("not a block", "no text in UTF-8, and so no line protocol") from None
     rows, at = list[dict[str, Any]](), _skip(text, 0)
     while at < len(text) and len(rows) <= MAX_ROWS:
-        found = LINE.match(text, at)
-        if found is None:
+        match = LINE.match(text, at)
+        if match is None:
             raise MessageError("not a block", f"no line protocol: {text[at : at + 60]!r}")
-        fields = {_plain(key): _parse_value(value) for key, value in FIELD.findall(found["fields"])}
-        tags = {_plain(key): _plain(value) for key, value in TAG.findall(found["tags"])}
-        row: dict[str, Any] = {"name": _plain(found["name"]), "tags": tags, "fields": fields}
-        if found["time"] is not None:
-            row["timestamp"] = int(found["time"][:25])
+        fields = {_plain(key): _parse_value(value) for key, value in FIELD.findall(match["fields"])}
+        tags = {_plain(key): _plain(value) for key, value in TAG.findall(match["tags"])}
+        row: dict[str, Any] = {"name": _plain(match["name"]), "tags": tags, "fields": fields}
+        if match["time"] is not None:
+            row["timestamp"] = int(match["time"][:25])
         rows.append(row)
-        at = _skip(text, found.end())
+        at = _skip(text, match.end())
     return rows
 
 
 def _skip(text: str, at: int) -> int:
-    found = BLANK.match(text, at)
-    return at if found is None else found.end()
+    match = BLANK.match(text, at)
+    return at if match is None else match.end()
 
 
 def _plain(text: str) -> str:

@@ -38,7 +38,7 @@ class TextPattern:
                 self._shared[k] = parts
                 levels.append("[^/]+")
                 continue
-            name = "".join(f"(?P={one})" if one in seen else f"(?P<{one}>[^/]+)" for one in parts[1:2])
+            name = "".join(f"(?P={part})" if part in seen else f"(?P<{part}>[^/]+)" for part in parts[1:2])
             seen.update(parts[1:2])
             levels.append(re.escape(parts[0]) + name + re.escape("".join(parts[2:])))
         self._regex = re.compile("/".join(levels))

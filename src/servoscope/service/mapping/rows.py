@@ -69,7 +69,7 @@ class MessageMapping(Decoder):
         if len(self._assets) < len(rates):
             raise ConfigError("payload.called: two assets of this source are called the same")
         self._only = next(iter(rates), "") if not settings.names_assets else ""
-        self._topics = [TextPattern(one) for one in settings.topics]
+        self._topics = [TextPattern(topic) for topic in settings.topics]
         self._rows = RowPath(settings.rows)
         self._match = [(split_path(path), TextPattern(text)) for path, text in settings.match.items()]
         self._good = [
@@ -88,24 +88,24 @@ class MessageMapping(Decoder):
         self._sparkplug = SparkplugDecoder(self._is_mapped) if settings.decoder == "sparkplug" else None
         self._senders: dict[str, dict[str, str]] = {}  # by asset, what its last topic said
         # where nothing but r, u and y is expected: the table of all of them, and what else may stand in it
-        parents = {one[:-1] for one in self._fields}
+        parents = {field[:-1] for field in self._fields}
         self._table = next(iter(parents)) if len(parents) == 1 and not self._by_name else None
         beside = (*self._time, *self._match, *self._good)
-        self._expected = {str(one[-1]) for one in self._fields} | {str(path[0]) for path, _ in beside}
+        self._expected = {str(field[-1]) for field in self._fields} | {str(path[0]) for path, _ in beside}
 
     @classmethod
     def of_assets(
         cls, settings: PayloadSettings, assets: Mapping[str, SourceAsset], rejections: RejectionCounter
     ) -> MessageMapping:
         """Return the mapping for the assets of a source."""
-        return cls(settings, {name: one.loop.sample_rate for name, one in assets.items()}, rejections.add)
+        return cls(settings, {name: asset.loop.sample_rate for name, asset in assets.items()}, rejections.add)
 
     def addresses(self, *, everyone: bool = False) -> list[str]:
         """Return what to subscribe to: the topics of these assets, as far as topics tell them, or of `everyone`."""
         values = {} if everyone else {ASSET: frozenset(self._assets)}
         if self._by_name:
             values[SIGNAL] = frozenset(self._by_name)
-        return sorted(set().union(*(one.filters(values) for one in self._topics)))
+        return sorted(set().union(*(topic.filters(values) for topic in self._topics)))
 
     def requests(self) -> list[tuple[str, bytes]]:
         """Return the messages that ask nodes of Sparkplug for their births."""
@@ -128,7 +128,7 @@ class MessageMapping(Decoder):
 
     def _match_topic(self, topic: str) -> dict[str, str] | None:
         """Return what the names of the first pattern that fits stand for."""
-        return next((found for one in self._topics if (found := one.match(topic)) is not None), None)
+        return next((found for text_pattern in self._topics if (found := text_pattern.match(topic)) is not None), None)
 
     def decode(self, message: InboxMessage) -> Content:
         """Return the values of a message; what has no time stamp was measured when it came."""
@@ -227,9 +227,13 @@ class MessageMapping(Decoder):
     ) -> Iterable[SignalValue]:
         stamps = self._read_times(around, received_at, asset)
         good = all(find_around(around, path) in contents for path, contents in self._good)
-        if not any(isinstance(one, list) for one in signals.values()) and isinstance(stamps, float):
-            return [SignalValue(k, stamps, self._number(k, one, good)) for k, one in signals.items()]
-        lengths = {len(one) if isinstance(one, list) else 1 for k, one in signals.items() if self._is_sampled(k, one)}
+        if not any(isinstance(signal, list) for signal in signals.values()) and isinstance(stamps, float):
+            return [SignalValue(k, stamps, self._number(k, signal, good)) for k, signal in signals.items()]
+        lengths = {
+            len(signal) if isinstance(signal, list) else 1
+            for k, signal in signals.items()
+            if self._is_sampled(k, signal)
+        }
         if len(lengths) > 1:
             raise MessageError("lengths", f"lists of {' and '.join(map(str, sorted(lengths)))} values in one row")
         n = lengths.pop() if lengths else 1
@@ -241,8 +245,10 @@ class MessageMapping(Decoder):
             raise MessageError("lengths", f"{len(stamps)} time stamps, {n} samples")
         return [
             SignalValue(k, t, self._number(k, value, good))
-            for k, one in signals.items()
-            for t, value in zip(stamps, one if isinstance(one, list) else [one], strict=self._is_sampled(k, one))
+            for k, signal in signals.items()
+            for t, value in zip(
+                stamps, signal if isinstance(signal, list) else [signal], strict=self._is_sampled(k, signal)
+            )
         ]
 
     def _is_sampled(self, signal: int, value: Any) -> bool:

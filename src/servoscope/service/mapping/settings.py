@@ -135,7 +135,7 @@ class PayloadSettings(Settings):
 
     @property
     def _names(self) -> frozenset[str]:
-        return self._row_names.union(*(TextPattern(one).names for one in self.topics))
+        return self._row_names.union(*(TextPattern(topic).names for topic in self.topics))
 
     @property
     def has_signal_names(self) -> bool:

@@ -148,7 +148,7 @@ class SparkplugDecoder:
 
     def _forget(self) -> None:
         """Forget the nodes that have been silent for longest, where there are too many or their births too large."""
-        size = sum(one.size for one in self._nodes.values())
+        size = sum(node.size for node in self._nodes.values())
         while len(self._nodes) > 1 and (size > MAX_METRICS or len(self._nodes) > MAX_NODES):
             size -= self._nodes.pop(next(iter(self._nodes))).size
 
@@ -189,7 +189,7 @@ def _row(metric: Any, about: _Node | None, sent: int) -> dict[str, Any] | None:
 
 
 def _birth_number(payload: Any) -> int:
-    found = [one for one in payload.metrics if one.name == SEQUENCE]
+    found = [metric for metric in payload.metrics if metric.name == SEQUENCE]
     return int(found[0].long_value or found[0].int_value) if found else -1
 
 

@@ -90,16 +90,16 @@ def decode_blocks(messages: Sequence[BlockMessage]) -> Iterator[Block | MessageE
         if size < PIECE_BYTES and end < len(messages):
             continue
         piece, begin, size = messages[begin:end], end, 0
-        texts = [b"" if each.content[:4] == MAGIC else each.content for each in piece]
-        for one, found in zip(piece, parse_regular(texts), strict=True):
-            if found is None or one.covariates:
+        texts = [b"" if message.content[:4] == MAGIC else message.content for message in piece]
+        for message, block in zip(piece, parse_regular(texts), strict=True):
+            if block is None or message.covariates:
                 try:
-                    yield decode_block(*one)
+                    yield decode_block(*message)
                 except MessageError as error:
                     yield error
                 continue
             yield Block.from_signals(
-                one.asset, found.sequence, found.signals, one.received_at, found.stream, found.oldest
+                message.asset, block.sequence, block.signals, message.received_at, block.stream, block.oldest
             )
 
 
@@ -199,18 +199,18 @@ def _parse_number(plain: dict[str, Any], name: str) -> float:
 
 
 def _parse_columns(plain: dict[str, Any], names: tuple[str, ...]) -> list[FloatArray]:
-    found = []
+    columns = []
     for name in names:
         values = plain.get(name)
         if not isinstance(values, list) or not set(map(type, values)) <= {int, float, type(None)}:
             raise MessageError("wrong type", f"{name}: missing, or no list of numbers and nulls")
         try:
-            found.append(np.array(values, dtype=np.float64))  # None becomes NaN
+            columns.append(np.array(values, dtype=np.float64))  # None becomes NaN
         except OverflowError:
             raise MessageError("wrong type", f"{name}: holds a number that no computer can hold") from None
-    if len({column.size for column in found}) > 1:
-        raise MessageError("lengths", f"{', '.join(f'{x.size} of {n}' for n, x in zip(names, found, strict=True))}")
-    return found
+    if len({column.size for column in columns}) > 1:
+        raise MessageError("lengths", f"{', '.join(f'{x.size} of {n}' for n, x in zip(names, columns, strict=True))}")
+    return columns
 
 
 def _uniform_times(t0: float, dt: float, n: int) -> FloatArray:
@@ -246,7 +246,7 @@ class BlockMessages(Decoder):
     """Decodes the blocks of some assets under the topics that begin with a prefix."""
 
     def __init__(self, prefix: str, assets: Mapping[str, SourceAsset]) -> None:
-        self._prefix, self._covariates = prefix, {name: one.covariates for name, one in assets.items()}
+        self._prefix, self._covariates = prefix, {name: asset.covariates for name, asset in assets.items()}
         list(decode_blocks([BlockMessage("", b"")]))  # compiles it, so that the first block does not wait for it
 
     def addresses(self, *, everyone: bool = False) -> list[str]:
@@ -267,11 +267,13 @@ class BlockMessages(Decoder):
 
     def decode_all(self, messages: Sequence[InboxMessage]) -> Iterator[Content | MessageError]:
         """Yield the block of each message, or why it is none."""
-        assets = [parse_asset(one.address) for one in messages]
+        assets = [parse_asset(message.address) for message in messages]
         if not self._covariates.keys() >= set(assets):
             yield from super().decode_all(messages)
             return
         named = zip(assets, messages, strict=True)
-        blocks = decode_blocks([BlockMessage(k, one.content, one.at, self._covariates[k]) for k, one in named])
+        blocks = decode_blocks(
+            [BlockMessage(k, message.content, message.at, self._covariates[k]) for k, message in named]
+        )
         for block in blocks:
             yield block if isinstance(block, MessageError) else Content(blocks=(block,))

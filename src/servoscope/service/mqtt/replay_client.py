@@ -86,8 +86,8 @@ class ReplayClient(BrokerConnection):
         self.settings = settings
         self._stream, self._stream_start = round(start.timestamp() * 1e6), start.timestamp()
         files = {
-            name: (tuple(settings.folder / file for file in one.files), Loop.load(settings.folder / one.loop))
-            for name, one in settings.assets.items()
+            name: (tuple(settings.folder / file for file in asset.files), Loop.load(settings.folder / asset.loop))
+            for name, asset in settings.assets.items()
         }
         self._covariates = {name: tuple(loop.columns.covariates) for name, (_, loop) in files.items()}
         self._replay = ReplayTransport(settings.replay.model_copy(update={"start": start}), files, self._covariates)
@@ -172,17 +172,21 @@ class ReplayClient(BrokerConnection):
                 queue.probe, queue.retry_s = queue.blocks[0].sequence, min(2.0 * queue.retry_s, MAX_RETRY_S)
                 queue.retry_at = now + queue.retry_s
             if queue.sent < len(queue.blocks):
-                for one in list(queue.blocks)[queue.sent :]:
-                    self._send(asset, one)
+                for block in list(queue.blocks)[queue.sent :]:
+                    self._send(asset, block)
                 queue.sent, queue.retry_at = len(queue.blocks), now + queue.retry_s
 
     def _release(self, queue: _SendQueue, sequence: int, now: float) -> None:
         """Drop an asset's blocks that were acknowledged, up to this one."""
         while queue.blocks and queue.blocks[0].sequence <= sequence:
-            one = queue.blocks.popleft()
+            unacknowledged_block = queue.blocks.popleft()
             queue.sent = max(0, queue.sent - 1)
-            if one.first_sent_at is not None:  # of a block sent twice, it is unknown which was answered (Karn, 1987)
-                queue.retry_s = max(self.settings.again_s, min(2.0 * (now - one.first_sent_at), MAX_RETRY_S))
+            if (
+                unacknowledged_block.first_sent_at is not None
+            ):  # of a block sent twice, it is unknown which was answered (Karn, 1987)
+                queue.retry_s = max(
+                    self.settings.again_s, min(2.0 * (now - unacknowledged_block.first_sent_at), MAX_RETRY_S)
+                )
             self.acknowledged += 1
         if sequence == queue.probe:
             queue.sent = 0  # it was answered, and none behind it: they are lost as well

@@ -102,7 +102,9 @@ class MqttTransport(BrokerConnection, Transport):  # type: ignore[override]  # w
         with self._lock:
             self._connection += 1
             self._waiting_again = {
-                (one.address, one.content): one.release for one in self.waiting if isinstance(one.release, _Delivery)
+                (message.address, message.content): message.release
+                for message in self.waiting
+                if isinstance(message.release, _Delivery)
             }
         if not accepted:
             return
@@ -141,8 +143,8 @@ class MqttTransport(BrokerConnection, Transport):  # type: ignore[override]  # w
         with self._lock:
             messages = super().receive(most)
             if self._waiting_again:
-                for one in messages:
-                    self._waiting_again.pop((one.address, one.content), None)
+                for message in messages:
+                    self._waiting_again.pop((message.address, message.content), None)
         return messages
 
     def _acknowledge(self, delivery: _Delivery) -> None:

@@ -50,7 +50,7 @@ def variable_values(status: Mapping[str, Any]) -> dict[str, Any]:
         "Since": datetime.fromtimestamp(status["since"], UTC),
         "T2": float(status.get("statistic") or 0.0),
         "Level": float(status.get("level") or 0.0),
-        "Fault": " + ".join(one["name"] for one in faults),
+        "Fault": " + ".join(fault["name"] for fault in faults),
         "Parameter": fault.get("parameter", ""),
         "Ratio": float(fault.get("ratio", 1.0)),
         "NE107": status["ne107"],
@@ -83,7 +83,7 @@ class OpcuaServer:
     def publish(self, statuses: StatusByAsset) -> None:
         """Show what has been stored."""
         with self._lock:
-            self._newest |= {name: one for name, one in statuses.items() if "verdict" in one}
+            self._newest |= {name: statuse for name, statuse in statuses.items() if "verdict" in statuse}
         if self._started.is_set() and not self._loop.is_closed():
             with contextlib.suppress(RuntimeError):  # closed in between
                 self._loop.call_soon_threadsafe(lambda: self._loop.create_task(self._write_values()))

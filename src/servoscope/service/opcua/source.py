@@ -138,7 +138,7 @@ class OpcuaTransport(ThreadTransport):
         self._password = read_password(settings.password_file, folder)
         check_files(folder, settings.cert_file, settings.key_file, settings.server_cert_file)
         self._assets = dict(assets)
-        check_nodes(settings.heartbeat, *(node for one in self._assets.values() for node in one.address.given))
+        check_nodes(settings.heartbeat, *(node for asset in self._assets.values() for node in asset.address.given))
         self._handles = 1  # of the next item that is monitored
         self.ends_within_s = 2.0 * settings.heartbeat_s
         self._subscriptions: list[ArraySubscription | ScalarSubscription] = []
@@ -148,12 +148,20 @@ class OpcuaTransport(ThreadTransport):
     @property
     def asset_troubles(self) -> dict[str, Reception]:  # type: ignore[override]
         """Assets whose nodes are refused, or come too slowly."""
-        return {one.asset: one.trouble for one in self._subscriptions if one.trouble is not None}
+        return {
+            subscription.asset: subscription.trouble
+            for subscription in self._subscriptions
+            if subscription.trouble is not None
+        }
 
     @property
     def update_intervals_s(self) -> dict[tuple[str, str], float]:  # type: ignore[override]
         """Time between two updates, as measured, by asset and signal [s]."""
-        return {(one.asset, name): value for one in self._subscriptions for name, value in one.intervals_s.items()}
+        return {
+            (subscription.asset, name): value
+            for subscription in self._subscriptions
+            for name, value in subscription.intervals_s.items()
+        }
 
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         """Connect, now or as soon as the server is there."""
@@ -229,7 +237,7 @@ class OpcuaTransport(ThreadTransport):
                 raise ConnectionError(f"the server has ended the subscription ({handler.end_status})")
             for one in self._subscriptions:
                 one.emit_blocks(self._server_time - max(SETTLING_S, 4.0 * period))
-            missing = any(one.refusal for one in grants.values())
+            missing = any(grant.refusal for grant in grants.values())
             if missing and time.monotonic() >= retry_at:  # the PLC may have been given its program meanwhile
                 retry_at = time.monotonic() + RETRY_NODES_S
                 period = await self._subscribe(subscription, grants)
@@ -241,18 +249,22 @@ class OpcuaTransport(ThreadTransport):
         """
         period, heartbeat = publishing_interval(subscription), self.settings.heartbeat
         wanted = {
-            node: ItemTerms(one.sampling_ms, one.queue_size(period))
-            for one in self._subscriptions
-            for node in one.nodes
+            node: ItemTerms(subscription.sampling_ms, subscription.queue_size(period))
+            for subscription in self._subscriptions
+            for node in subscription.nodes
         }
         wanted[heartbeat] = ItemTerms(1000.0 * period, 1)
-        missing = {node: one for node, one in wanted.items() if node not in grants or grants[node].refusal}
-        changed = [one for one in self._subscriptions if not missing.keys().isdisjoint(one.nodes)]
+        missing = {node: terms for node, terms in wanted.items() if node not in grants or grants[node].refusal}
+        changed = [
+            subscription for subscription in self._subscriptions if not missing.keys().isdisjoint(subscription.nodes)
+        ]
         grants |= await monitor_nodes(subscription, missing, self._handles)
         self._handles += len(missing)
         if grants[heartbeat].refusal:
             raise ConfigError(render(message("service.trouble.node", node=heartbeat, reason=grants[heartbeat].refusal)))
-        longest = min((one.longest_interval_s(grants) for one in self._subscriptions), default=math.inf)
+        longest = min(
+            (subscription.longest_interval_s(grants) for subscription in self._subscriptions), default=math.inf
+        )
         if longest < period:
             period = await shorten_interval(subscription, longest / QUEUE_MARGIN)
         for one in changed:

@@ -80,10 +80,10 @@ async def monitor_nodes(subscription: Any, wanted: Mapping[str, ItemTerms], firs
     finally:
         subscription.server = session
     return {
-        node: ItemTerms(one.RevisedSamplingInterval, one.RevisedQueueSize)
-        if one.StatusCode.is_good()
-        else ItemTerms(0.0, 0, one.StatusCode.name)
-        for node, one in zip(wanted, recorder.answers, strict=True)
+        node: ItemTerms(answer.RevisedSamplingInterval, answer.RevisedQueueSize)
+        if answer.StatusCode.is_good()
+        else ItemTerms(0.0, 0, answer.StatusCode.name)
+        for node, answer in zip(wanted, recorder.answers, strict=True)
     }
 
 
@@ -216,12 +216,12 @@ class ScalarSubscription(_Subscription):
         needed = math.ceil(publishing_s / self.value_s)
         granted = [grants[node] for node in self.nodes[: len(SIGNALS)]]
         limit_ms = MAX_PERIODS * self.sampling_ms
-        self._granted_ms = {k: one.sampling_ms for k, one in enumerate(granted) if one.sampling_ms > limit_ms}
+        self._granted_ms = {k: terms.sampling_ms for k, terms in enumerate(granted) if terms.sampling_ms > limit_ms}
         values = {"publishing_ms": 1000.0 * publishing_s, "needed": needed}
         short = [
-            render(message("service.trouble.queue", signal=SIGNALS[k], queue=one.queue, **values))
-            for k, one in enumerate(granted)
-            if not one.refusal and k not in self._granted_ms and one.queue < needed
+            render(message("service.trouble.queue", signal=SIGNALS[k], queue=terms.queue, **values))
+            for k, terms in enumerate(granted)
+            if not terms.refusal and k not in self._granted_ms and terms.queue < needed
         ]
         self._short_queues = ", ".join(short)
         if self.trouble is None:

@@ -108,9 +108,9 @@ class BlockAssembler:
     def slow_ms(self) -> dict[int, float]:
         """Time between two updates of the signals that come too slowly, as measured [ms]; covariates may."""
         return {  # more digits would change with each look
-            k: float(f"{1000.0 * one.interval_s:.2g}")
-            for k, one in enumerate(self.rates[: len(SIGNALS)])
-            if one.is_too_slow(self.period)
+            k: float(f"{1000.0 * rate.interval_s:.2g}")
+            for k, rate in enumerate(self.rates[: len(SIGNALS)])
+            if rate.is_too_slow(self.period)
         }
 
     def describe_slow(self, signal: int, interval_ms: float) -> str:
@@ -236,7 +236,7 @@ class AssetStream(BlockAssembler):
 
     def hold(self, values: Sequence[SignalValue], receipt: Receipt) -> None:
         """Hold a message until its values are in a block."""
-        times = [one.t for one in values]
+        times = [value.t for value in values]
         receipt.holders += 1
         self.open.append(_OpenMessage(min(times), max(times), receipt))
 
@@ -281,10 +281,10 @@ class AssetStream(BlockAssembler):
     def take_closed(self) -> list[Receipt]:
         """Return the messages of which no value waits any more."""
         times, closed, waiting = self.waiting_times, list[Receipt](), deque[_OpenMessage]()
-        for one in self.open:
-            if one.waits(times):
-                waiting.append(one)
+        for open_message in self.open:
+            if open_message.waits(times):
+                waiting.append(open_message)
             else:
-                closed.append(one.receipt)
+                closed.append(open_message.receipt)
         self.open = waiting
         return closed

@@ -332,7 +332,9 @@ class FolderTransport(ThreadTransport):
             del self._digests[next(iter(self._digests))]
         for why in dict.fromkeys(failures.values()):
             self.rejections.add(file.asset, "unreadable", why)
-        kept = {name: one for name, one in self.asset_troubles.items() if name not in assets or not rows}
+        kept = {
+            name: asset_trouble for name, asset_trouble in self.asset_troubles.items() if name not in assets or not rows
+        }
         self.asset_troubles = kept | {name: Reception("refused", why) for name, why in failures.items()}
         is_new = file.name not in (self._first_names or ())
         read = ReadFile(file, rows, is_new, FAILED if failures else DONE)

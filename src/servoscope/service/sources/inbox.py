@@ -89,7 +89,7 @@ class Inbox:
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         """Start; assets in `resume` continue behind that position."""
         self._resume = resume
-        self._newest = {asset: (one.stream, one.sequence) for asset, one in resume.items()}
+        self._newest = {asset: (position.stream, position.sequence) for asset, position in resume.items()}
         self._confirmed = dict(self._newest)
         if self.state_file is not None and self.decoder.trial is not None:
             try:
@@ -112,14 +112,14 @@ class Inbox:
     @property
     def asset_troubles(self) -> Mapping[str, Reception]:
         """Assets that come too slowly, or whose sender is gone or refuses them."""
-        own = {name: one.trouble for name, one in self._streams.items() if one.trouble is not None}
+        own = {name: stream.trouble for name, stream in self._streams.items() if stream.trouble is not None}
         return {**own, **self.transport.asset_troubles}
 
     @property
     def update_intervals_s(self) -> Mapping[tuple[str, str], float]:
         """Time between two updates of single values, as measured, by asset and signal [s]."""
         streams = self._streams.items()
-        own = {(name, signal): s for name, one in streams for signal, s in one.intervals_s.items()}
+        own = {(name, signal): s for name, stream in streams for signal, s in stream.intervals_s.items()}
         return {**own, **self.transport.update_intervals_s}
 
     @property
@@ -162,7 +162,7 @@ class Inbox:
             self._guard.end()
         if self._streams:
             # no more may come before some of these are released
-            is_full = sum(len(one.open) for one in self._streams.values()) > self._in_flight // 2
+            is_full = sum(len(stream.open) for stream in self._streams.values()) > self._in_flight // 2
             quiet_s = max(MAX_QUIET_S, 2.0 * self.decoder.block_s)
             self._flush(math.inf if is_full else time.monotonic() - quiet_s)
 
@@ -260,9 +260,9 @@ class Inbox:
 
     def _drop_future(self, name: str, values: list[SignalValue], latest: float) -> list[SignalValue]:
         """Return the values that do not claim to be later than that [UTC s]; count others."""
-        credible = [one for one in values if one.t <= latest]
+        credible = [value for value in values if value.t <= latest]
         if len(credible) < len(values):
-            words = text("service.reception.future", ahead_s=round(max(one.t for one in values) - latest, 1))
+            words = text("service.reception.future", ahead_s=round(max(value.t for value in values) - latest, 1))
             self.rejections.add(name, "future", render(words), len(values) - len(credible))
         return credible
 

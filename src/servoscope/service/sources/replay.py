@@ -46,10 +46,10 @@ class ReplaySettings(SourceSettings):
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> Inbox:
         """Return the source of these recordings."""
         files = {
-            each: (tuple(Path(file) if is_address(file) else folder / file for file in one.address), one.loop)
-            for each, one in assets.items()
+            each: (tuple(Path(file) if is_address(file) else folder / file for file in asset.address), asset.loop)
+            for each, asset in assets.items()
         }
-        covariates = {each: one.covariates for each, one in assets.items()}
+        covariates = {each: asset.covariates for each, asset in assets.items()}
         return Inbox(ReplayTransport(self, files, covariates), BlockDecoder(), assets)
 
 

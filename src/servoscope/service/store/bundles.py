@@ -85,7 +85,7 @@ class BundleIndex:
             del self._sparse[key], counts[key]
             changes.sparse.append(key)
         # after an outage most of them are old by now
-        wanted = [one for one in blocks if one[1] >= first_needed.get(one[0], one[1])]
+        wanted = [block for block in blocks if block[1] >= first_needed.get(block[0], block[1])]
         bundles: defaultdict[BundleKey, tuple[list[BundlePart], list[bytes]]] = defaultdict(lambda: ([], []))
         sizes, newest = defaultdict[int, int](int), self._number  # of each bundle, bytes so far
         for asset, sequence, stored, regular in wanted:
@@ -123,7 +123,7 @@ def pack_samples(signals: FloatArray) -> list[tuple[bytes, bool]]:
     tail = covariate_tail(rows - 4)
     t, first = numbers[:, 0], numbers[:, 0, :1]
     if n < 2:
-        return [(one.tobytes() + tail, False) for one in numbers]
+        return [(number.tobytes() + tail, False) for number in numbers]
     with np.errstate(all="ignore"):  # what is no time is kept as it is
         rate = np.round((n - 1) / (t[:, -1:] - first), RATE_DIGITS)
         regular = ((first + np.arange(n) / rate).view(np.int64) == t.view(np.int64)).all(axis=1)
@@ -188,7 +188,7 @@ def read_samples(
                     if asset in found:
                         found[asset].append((sequence, samples))
         for name, blocks in found.items():
-            yield name, sorted(one for one in blocks if one[0] >= first[name])
+            yield name, sorted(block for block in blocks if block[0] >= first[name])
 
 
 def _first_needed(connection: sa.Connection, assets: Iterable[str]) -> dict[str, int]:

@@ -40,10 +40,10 @@ def thin_sizes(store: Store, asset: str, now: float, since: float | None = None)
     for age, width in TIERS:
         end = math.floor((now - age) / width) * width
         begin = -math.inf if since is None else math.floor((since - age) / width) * width
-        found = store.fetch(_crowded_parts(width), {"of_asset": asset, "begin": begin, "end": end})
-        spans = [{**row, "from_t": row["part"] * width, "to_t": (row["part"] + 1) * width} for row in found]
+        mappings = store.fetch(_crowded_parts(width), {"of_asset": asset, "begin": begin, "end": end})
+        spans = [{**row, "from_t": row["part"] * width, "to_t": (row["part"] + 1) * width} for row in mappings]
         store.replace_sizes(spans)
-        gone += sum(row["rows"] - 1 for row in found)
+        gone += sum(row["rows"] - 1 for row in mappings)
     return gone
 
 

@@ -115,19 +115,19 @@ class Store:
         if it cannot be used.
         """
         try:
-            found = engine.parse_store_url(url, folder or Path.cwd())
-            store = cls(found, engine.create_store_engine(found, lock_timeout_s=lock_timeout_s, write=write))
+            store_url = engine.parse_store_url(url, folder or Path.cwd())
+            store = cls(store_url, engine.create_store_engine(store_url, lock_timeout_s=lock_timeout_s, write=write))
         except ModuleNotFoundError as error:
             raise StoreError(f"{error.name} is missing, pip install 'servoscope[service]'") from None
-        is_file = found.get_backend_name() == "sqlite"
+        is_file = store_url.get_backend_name() == "sqlite"
         store._has_lock = has_lock and is_file
         if is_file:
-            if not write and not Path(found.database or "").exists():
+            if not write and not Path(store_url.database or "").exists():
                 raise StoreError(f"{store.name}: no such store, servoscope run makes it")
-            engine.check_folder(Path(str(found.database)))
+            engine.check_folder(Path(str(store_url.database)))
         # Two processes that begin with an empty file lock each other out for a moment, and a reader may see the file
         # before its tables. SQLite does not wait there, as one of them would wait for the other for ever.
-        end = time.monotonic() + (OPENING_S if is_file and (write or _is_new(found.database)) else 0.0)
+        end = time.monotonic() + (OPENING_S if is_file and (write or _is_new(store_url.database)) else 0.0)
         try:
             store._version = store._retry(
                 end, lambda connection: schema.create_or_migrate(connection, store.name, write=write)

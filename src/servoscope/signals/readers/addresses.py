@@ -119,8 +119,8 @@ def open_address(text: str, layout: TextLayout | None = None) -> TableFile | Non
 
     Raises RecordingError if the table cannot be read.
     """
-    found = _find_opener(text)
-    if found is None:
+    opener = _find_opener(text)
+    if opener is None:
         return None
-    opened: TableFile = found.load()(replace(parse_address(text), text_layout=layout))
+    opened: TableFile = opener.load()(replace(parse_address(text), text_layout=layout))
     return opened

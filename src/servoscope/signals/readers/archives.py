@@ -77,8 +77,8 @@ def list_members(path: Path) -> list[str]:
 def _open_archive(path: Path) -> tuple[zipfile.ZipFile, list[str]]:
     """Return an archive and the names of its files; raises RecordingError if it is damaged."""
     try:
-        found = path.stat()
-        return _open_version(path, found.st_mtime_ns, found.st_size)
+        stat_result = path.stat()
+        return _open_version(path, stat_result.st_mtime_ns, stat_result.st_size)
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
         raise RecordingError(f"{path}: is a damaged ZIP archive ({shorten_error(error)}), pack it again") from None
 

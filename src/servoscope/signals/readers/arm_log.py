@@ -87,7 +87,7 @@ def read_arm_log(path: Source | Path, loop: ArmLoop, arm: Kinematics) -> ArmReco
         (0, *gaps.tolist()),
         _joint_positions(loop, arm, resampled),
         _joint_torques(loop, arm, resampled),
-        np.column_stack([resampled.get(f"{each}.temperature", np.zeros(rows.t.size)) for each in arm.names]),
+        np.column_stack([resampled.get(f"{name}.temperature", np.zeros(rows.t.size)) for name in arm.names]),
         resampled.get("tool", np.zeros(rows.t.size)),
     )
     if recording.duration_s < MIN_DURATION_S:

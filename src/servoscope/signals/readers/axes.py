@@ -24,9 +24,17 @@ def signal_names(channels: Sequence[ChannelInfo]) -> list[str]:
     """
     likely = guess_columns([channel.name for channel in channels])
     clocks = {channel.name for channel in channels if guess_columns([channel.name]).keys() == {"t"}}
-    named = [each for each in channels if each.name in clocks or each.min < each.max or each.name == likely.get("r")]
-    names = [each.name for each in named if each.name in clocks or not math.isnan(each.min)]
-    supplies = {each.name for each in channels if 0.0 < each.min < each.max < MAX_SUPPLY_RATIO * each.min} - clocks
+    named = [
+        channel
+        for channel in channels
+        if channel.name in clocks or channel.min < channel.max or channel.name == likely.get("r")
+    ]
+    names = [
+        channel_info.name for channel_info in named if channel_info.name in clocks or not math.isnan(channel_info.min)
+    ]
+    supplies = {
+        channel.name for channel in channels if 0.0 < channel.min < channel.max < MAX_SUPPLY_RATIO * channel.min
+    } - clocks
     moving = [name for name in names if name not in supplies]
     lost = {"u", "y"} & guess_columns(names).keys() - guess_columns(moving).keys()
     return names if lost else moving
@@ -40,13 +48,13 @@ def find_axes(names: Sequence[str]) -> dict[str, list[str]]:
     """
     groups: dict[str, dict[str, str]] = defaultdict(dict)  # mark -> name with a blank in its place -> name
     for name in names:
-        for found in MARK.finditer(name):
-            blank = f"{name[: found.start()]}\0{name[found.end() :]}"
+        for match in MARK.finditer(name):
+            blank = f"{name[: match.start()]}\0{name[match.end() :]}"
             if blank.strip("\0 _[]()"):  # a name that is nothing but its mark tells nothing: x, y
-                groups[found[0]][blank] = name
-    shared = {blank for each in groups.values() for blank in each}
-    shared = {blank for blank in shared if sum(blank in each for each in groups.values()) > 1}
-    own = {mark: [each[blank] for blank in each if blank in shared] for mark, each in groups.items()}
+                groups[match[0]][blank] = name
+    shared = {blank for group in groups.values() for blank in group}
+    shared = {blank for blank in shared if sum(blank in group for group in groups.values()) > 1}
+    own = {mark: [group[blank] for blank in group if blank in shared] for mark, group in groups.items()}
     marked = {name for each in own.values() for name in each}
     axes = {}
     for mark, mine in own.items():

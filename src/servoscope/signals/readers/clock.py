@@ -39,20 +39,20 @@ def parse_moment(text: str) -> tuple[int | None, float] | None:
     slashes is month, day, year, unless the first is more than 12.
     """
     text = text.strip()
-    found = MOMENT.fullmatch(text) if text[:1].isdigit() else None
-    if found is None or (found["date"] is None and found["h"] is None):
+    match = MOMENT.fullmatch(text) if text[:1].isdigit() else None
+    if match is None or (match["date"] is None and match["h"] is None):
         duration = DURATION.fullmatch(text)
         return (None, float(duration[1]) * DURATIONS[duration[2]]) if duration else None
-    day = _day_number(found["date"]) if found["date"] else None
-    if (found["date"] and day is None) or int(found["h"] or 0) > 24 or int(found["m"] or 0) > 59:
+    day = _day_number(match["date"]) if match["date"] else None
+    if (match["date"] and day is None) or int(match["h"] or 0) > 24 or int(match["m"] or 0) > 59:
         return None
-    seconds = 3600.0 * int(found["h"] or 0) + 60.0 * int(found["m"] or 0)
-    if found["s"]:
-        whole, fraction = found["s"][:2], found["s"][3:]
+    seconds = 3600.0 * int(match["h"] or 0) + 60.0 * int(match["m"] or 0)
+    if match["s"]:
+        whole, fraction = match["s"][:2], match["s"][3:]
         seconds += int(whole) + (int(fraction) / 10 ** len(fraction) if fraction else 0.0)
-    if found["half"]:
-        seconds += {"am": 0.0, "pm": 43200.0}[found["half"].lower()] - 43200.0 * (int(found["h"]) == 12)
-    zone = found["zone"]
+    if match["half"]:
+        seconds += {"am": 0.0, "pm": 43200.0}[match["half"].lower()] - 43200.0 * (int(match["h"]) == 12)
+    zone = match["zone"]
     if zone and zone[0] in "+-":
         minutes = 60 * int(zone[1:3]) + int(zone[-2:])
         seconds -= 60.0 * minutes * (1 if zone[0] == "+" else -1)

@@ -147,14 +147,14 @@ def parse_combination(text: str, known: Iterable[str], where: str) -> LinearComb
     try:
         tree = ast.parse(code.strip(), mode="eval").body
         names = {f"quoted_{index}_": name for index, name in enumerate(quoted)}
-        found = _evaluate(tree, names, known, where)
+        combination = _evaluate(tree, names, known, where)
     except (SyntaxError, ValueError, RecursionError, ZeroDivisionError, OverflowError, MemoryError):
         if re.fullmatch(r"[\w .]+", stripped):
             find_channel(stripped, known, where)
         raise LoopError(f"{where} = {text!r}: {ALLOWED_EXPRESSIONS}; put odd names in backticks") from None
-    if not any(found.factors.values()):
+    if not any(combination.factors.values()):
         raise LoopError(f"{where} = {text!r}: names no channel")
-    return found
+    return combination
 
 
 def parse_output(columns: Columns, known: Iterable[str], where: str) -> tuple[LinearCombination, ...]:

@@ -89,28 +89,28 @@ def detect_layout(path: Path, head: bytes, text: TextLayout, cut: bool = False) 
         split |= {";": _split_lines(plain, ";", "")}
     delimiter = max(split, key=lambda each: _score(split[each]))
     rows = split[delimiter]
-    found = find_table(rows, str(path), header)
+    table = find_table(rows, str(path), header)
     used = "" if delimiter == line_end else line_end
-    if found is None:  # no row of numbers: the first line says what the columns are, and what follows is told later
+    if table is None:  # no row of numbers: the first line says what the columns are, and what follows is told later
         delimiter = max(split, key=lambda each: len(next(filter(None, split[each]), [])))
         first, cells = next((i, row) for i, row in enumerate(split[delimiter]) if row)
         check_names(cells, str(path))
         named = tuple(cell or f"c{index}" for index, cell in enumerate(cells))
         return CsvLayout(delimiter, ".", named, first + 1, encoding, comments, used)
-    decimal, thousands = _detect_decimal(rows[found.first :])
-    names = found.names
-    above = next((row for row in reversed(rows[: found.first]) if row), [])
+    decimal, thousands = _detect_decimal(rows[table.first :])
+    names = table.names
+    above = next((row for row in reversed(rows[: table.first]) if row), [])
     if header is None and delimiter == "," and not any(map(is_number, above)) and 2 * len(above) == len(names):
         raise RecordingError(
             f"{path}: {len(names)} numbers stand under {len(above)} names: commas are decimal signs and delimiters at"
             " once; export with ; between the columns, or with decimal points"
         )
-    commented = [line.lstrip().lstrip("".join(comments)) for line in lines[: found.first] if line.strip()]
+    commented = [line.lstrip().lstrip("".join(comments)) for line in lines[: table.first] if line.strip()]
     if names == tuple(f"c{index}" for index in range(len(names))) and commented and not above:
         told = _split_lines(commented[-1:], delimiter, used)[0]  # the names may stand in the last comment
         if len(told) == len(names) and all(told) and len(set(told)) == len(told) and not any(map(is_number, told)):
             names = tuple(told)
-    return CsvLayout(delimiter, decimal, names, found.first, encoding, comments, used, thousands)
+    return CsvLayout(delimiter, decimal, names, table.first, encoding, comments, used, thousands)
 
 
 def _score(rows: list[list[str]]) -> tuple[int, int]:

@@ -110,7 +110,7 @@ COMPATIBLE_KINDS = {
 
 def readable_suffixes() -> list[str]:
     """Return the suffixes of the files that can be read with what is installed, those of other packages last."""
-    others = (f".{found.name.lower()}" for found in entry_points(group=ENTRY_POINTS))
+    others = (f".{point.name.lower()}" for point in entry_points(group=ENTRY_POINTS))
     installed = (suffix for suffix, reader in BUILT_IN.items() if reader.installed)
     return list(dict.fromkeys([*installed, *ARCHIVES, *others]))
 
@@ -152,7 +152,7 @@ def _open_plain(path: Path, text: TextLayout | None) -> TableFile:
         _check_format(path, head, reader.format)
         opened = reader.open(path, text)
     else:  # looked up only now: it takes a hundredth of a second
-        other = next((found for found in entry_points(group=ENTRY_POINTS) if f".{found.name.lower()}" == suffix), None)
+        other = next((point for point in entry_points(group=ENTRY_POINTS) if f".{point.name.lower()}" == suffix), None)
         if other is None:
             found = _recognise(head)
             what = f", it looks like a {found}" if found else ""

@@ -141,7 +141,7 @@ def guess_columns(names: Sequence[str]) -> dict[str, str]:
     if (pair := _named_alike(plain, parts)) is not None:
         found["r"], found["y"] = pair
     for whole in (True, False):  # a name that is the word comes before one that only contains it
-        for letter in [each for each in words if each not in found]:
+        for letter in [word for word in words if word not in found]:
             among = {"t": values, "r": plain}.get(letter, signals)
             if letter == "y":
                 among = [name for name in signals if not ("output" in parts[name] and parts[name] & CONTROLLER_WORDS)]
@@ -200,17 +200,17 @@ def guess_mapping(names: Sequence[str]) -> dict[str, Any]:
 
     None stands where no name suggests a column; a date and a time of day in two columns are one clock.
     """
-    found = guess_columns(names)
+    columns = guess_columns(names)
     fields: dict[str, Any] = {field: None for field in FIELDS.values()}
-    for letter, column in found.items():
+    for letter, column in columns.items():
         fields[FIELDS[letter]] = column if letter == "t" else scaled_channel(column)
-    if "r" in found and "y" not in found:
+    if "r" in columns and "y" not in columns:
         error = next((name for name in names if _words(name) & ERRORS), None)
-        fields["output"] = error and f"{scaled_channel(found['r'], True)} - {scaled_channel(error, True)}"
+        fields["output"] = error and f"{scaled_channel(columns['r'], True)} - {scaled_channel(error, True)}"
     clock = _clock_columns(names)
     if len(clock) > 1:
         fields["time"] = " + ".join(clock)
-    unit = "s" if len(clock) > 1 else TIME_UNITS.get(split_unit(found.get("t", ""))[1], "s")
+    unit = "s" if len(clock) > 1 else TIME_UNITS.get(split_unit(columns.get("t", ""))[1], "s")
     return {**fields, "time_unit": unit, "segment": []}
 
 

@@ -83,10 +83,10 @@ def _iceberg_table(place: str) -> Any:
         from pyiceberg.table import StaticTable
 
         if folder.is_dir():  # the newest version, as its number says
-            found = sorted(folder.glob("metadata/*.metadata.json"), key=lambda path: _version(path.name))
-            if not found:
+            paths = sorted(folder.glob("metadata/*.metadata.json"), key=lambda path: _version(path.name))
+            if not paths:
                 raise FileNotFoundError("holds no metadata/*.metadata.json")
-            return StaticTable.from_metadata(str(found[-1].absolute()))
+            return StaticTable.from_metadata(str(paths[-1].absolute()))
         return StaticTable.from_metadata(_location(place))
     from pyiceberg.catalog import load_catalog
 
@@ -95,8 +95,8 @@ def _iceberg_table(place: str) -> Any:
 
 
 def _version(name: str) -> int:
-    found = re.match(r"v?(\d+)", name)
-    return int(found[1]) if found else -1
+    match = re.match(r"v?(\d+)", name)
+    return int(match[1]) if match else -1
 
 
 def _location(place: str) -> str:

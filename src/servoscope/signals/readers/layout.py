@@ -179,8 +179,8 @@ def _scope_names(keyed: dict[str, list[str]], width: int, file: str) -> list[str
     key = next(key for key in keyed if SAMPLE_TIME_KEY.fullmatch(key))
     if len({keyed[key][place] for place in places}) > 1:
         raise RecordingError(f"{file}: its channels have different sample times, export those of one sample time")
-    found = SAMPLE_TIME_KEY.fullmatch(key)
-    unit = found[1] if found is not None and found[1] in TIME_UNITS else "ms"
+    match = SAMPLE_TIME_KEY.fullmatch(key)
+    unit = match[1] if match is not None and match[1] in TIME_UNITS else "ms"
     names = [""] * width
     for place in places:
         of = keyed.get("Unit", [""] * width)[place]

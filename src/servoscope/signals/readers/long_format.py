@@ -97,12 +97,12 @@ def _read_columns(opened: TableFile, names: Sequence[str]) -> dict[str, Any]:
     for table in opened.iter_chunks(names):
         for name in names:
             pieces[name].append(table.columns[name])
-    found = {}
+    columns = {}
     for name, parts in pieces.items():
         if len({part.type for part in parts}) > 1:
             parts = [part.cast(pa.string()) for part in parts]
-        found[name] = pa.chunked_array([chunk for part in parts for chunk in part.chunks])
-    return found
+        columns[name] = pa.chunked_array([chunk for part in parts for chunk in part.chunks])
+    return columns
 
 
 def _text_codes(column: Any) -> tuple[npt.NDArray[np.intp], list[str]] | None:

@@ -118,14 +118,14 @@ def _load_objects(path: Path) -> dict[str, Any]:
     """Return tables and timetables as mappings of their columns."""
     from matio import load_from_mat
 
-    found = {}
+    objects = {}
     for name, value in load_from_mat(str(path)).items():
         if hasattr(value, "columns") and hasattr(value, "index"):  # a frame of pandas
             columns = {str(column): np.asarray(value[column]) for column in value.columns}
             if value.index.dtype.kind in "mM":  # of a timetable
                 columns = {str(value.index.name or "Time"): np.asarray(value.index)} | columns
-            found[name] = columns
-    return found
+            objects[name] = columns
+    return objects
 
 
 def _load_hdf5(path: Path, matlab: bool) -> dict[str, Any]:

@@ -55,7 +55,7 @@ def open_mdf(path: Path) -> TableFile:
     _ignore_external_attachments()
 
     def list_rasters(file: Any) -> list[_Raster]:
-        found = []
+        rasters = []
         for g, group in enumerate(file.groups):
             master = file.masters_db.get(g)
             names: dict[str, Any] = {}
@@ -66,8 +66,8 @@ def open_mdf(path: Path) -> TableFile:
                 units.setdefault(name, str(file.get_channel_unit(group=g, index=i) or "").strip())
             if group.channel_group.cycles_nr > MAX_RATIO * path.stat().st_size:  # the library would read for ever
                 raise ValueError("names more rows than it can hold")
-            found.append(_Raster(int(group.channel_group.cycles_nr), names, units))
-        return found
+            rasters.append(_Raster(int(group.channel_group.cycles_nr), names, units))
+        return rasters
 
     def read(file: Any, raster: _Raster, names: Sequence[str], first: int, rows: int) -> Mapping[str, Any]:
         places = [raster.places[name] for name in names]

@@ -31,8 +31,8 @@ def open_sheet(path: Path) -> TableFile:
             raise RecordingError(f"{path}: is protected by a password, save it without one") from None
         raise RecordingError(f"{path}: is a damaged workbook ({shorten_error(error)}), save it again") from None
     for rows in sheets:
-        if (found := _find_sheet_table(path, rows)) is not None:
-            return found
+        if (sheet_table := _find_sheet_table(path, rows)) is not None:
+            return sheet_table
     raise RecordingError(f"{path}: holds no sheet with a table of numbers")
 
 
@@ -41,17 +41,17 @@ def _find_sheet_table(path: Path, rows: Sequence[Sequence[Any]]) -> TableFile | 
     import pyarrow as pa
 
     head = [[_cell_text(cell) for cell in row] for row in rows[:HEAD_ROWS]]
-    found = find_table([row if any(row) else [] for row in head], str(path))
-    if found is None:
+    table = find_table([row if any(row) else [] for row in head], str(path))
+    if table is None:
         return None
-    check_width(path, len(found.names))
-    body = rows[found.first :]
+    check_width(path, len(table.names))
+    body = rows[table.first :]
     columns = {
         name: pa.chunked_array([_sheet_column([row[index] if index < len(row) else "" for row in body])])
-        for index, name in enumerate(found.names)
+        for index, name in enumerate(table.names)
         if name
     }
-    return TableFile(path, tuple(columns), lambda *_: iter([Table(path.name, columns, found.first + 1)]))
+    return TableFile(path, tuple(columns), lambda *_: iter([Table(path.name, columns, table.first + 1)]))
 
 
 def _cell_text(cell: Any) -> str:

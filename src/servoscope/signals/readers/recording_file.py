@@ -51,7 +51,7 @@ def list_channels(path: str | Path, text: TextLayout | None = None) -> list[Chan
     opened = open_file(path, text)
     ranges: dict[str, list[tuple[float, float]]] = {name: [] for name in opened.columns}
     types: dict[str, list[str]] = {name: [] for name in opened.columns}
-    for table in (each for names in opened.channel_groups or [opened.columns] for each in opened.iter_chunks(names)):
+    for table in (table for names in opened.channel_groups or [opened.columns] for table in opened.iter_chunks(names)):
         for name, column in table.columns.items():
             types[name].append(str(column.type))
             try:
@@ -176,8 +176,8 @@ def _read_log(path: Source, loop: Loop | None, columns: Columns, where: Mapping[
     while True:
         try:
             return _read_rows(open_source(path, columns.text), loop, columns, where, by, texts)
-        except ColumnTypeChanged as found:  # what was taken for numbers belongs to a column of text
-            texts.add(found.column)
+        except ColumnTypeChanged as changed:  # what was taken for numbers belongs to a column of text
+            texts.add(changed.column)
 
 
 def _read_rows(
@@ -205,7 +205,7 @@ def _read_rows(
     clock = _find_time_column(opened, columns, loop)
     segments = [CellReader(find_channel(x, known, f"{name}: [columns] segment")) for x in columns.segment]
     wanted = {*chosen.columns, *(x for several in signals.values() for signal in several for x in signal.factors)}
-    wanted |= {each.column for each in (apart, *segments) if each is not None}
+    wanted |= {reader.column for reader in (apart, *segments) if reader is not None}
     if clock is not None:
         wanted |= set(clock.columns)
         texts |= clock.texts
@@ -224,7 +224,7 @@ def _read_rows(
             cells = apart.read(table)
             rows = {format_cell(v): mask & (cells == v) for v in dict.fromkeys(cells[mask].tolist())}
         each = {
-            what: [_evaluate_signal(table, one, what, unwrappers) for one in several]
+            what: [_evaluate_signal(table, combination, what, unwrappers) for combination in several]
             for what, several in signals.items()
         }
         values = [
@@ -234,7 +234,7 @@ def _read_rows(
         if clock is not None:
             values.insert(0, clock.seconds(table))
         if segments:
-            runs = run + np.cumsum(np.any([each.changes(table) for each in segments], axis=0))
+            runs = run + np.cumsum(np.any([segment.changes(table) for segment in segments], axis=0))
             run = int(runs[-1])
             values.append(runs)
         if sensors:

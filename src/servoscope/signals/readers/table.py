@@ -106,7 +106,8 @@ class TimeColumn:
         if len(self.columns) == 1:
             return self._elapsed(self._column_seconds(table, self.columns[0], self._unit))
         parts = [
-            self._column_seconds(table, each, TIME_UNITS_BY_NAME.get(each.casefold(), "s")) for each in self.columns
+            self._column_seconds(table, column, TIME_UNITS_BY_NAME.get(column.casefold(), "s"))
+            for column in self.columns
         ]
         return self._elapsed(np.asarray(np.sum(parts, axis=0)))
 

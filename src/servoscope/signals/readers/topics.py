@@ -79,9 +79,9 @@ def _open_messages(path: Path, messages: Iterable[tuple[str, int, Any]]) -> Tabl
         if count > MAX_VALUES:
             raise RecordingError(f"{path}: holds more than {MAX_VALUES} values, leave topics out")
     topics = {}
-    for topic, each in rows.items():
-        names = list(dict.fromkeys(name for fields in each for name in fields))
-        topics[topic] = {name: np.array([fields.get(name, np.nan) for fields in each]) for name in names}
+    for topic, row in rows.items():
+        names = list(dict.fromkeys(name for fields in row for name in fields))
+        topics[topic] = {name: np.array([fields.get(name, np.nan) for fields in row]) for name in names}
     return _open_topics(path, topics)
 
 

@@ -80,10 +80,10 @@ def with_unit(name: str, unit: str) -> str:
 
 def parse_quantity(text: str, name: str) -> float | None:
     """Return a number with its unit behind it, in the unit of its column's name, else in SI units; None: it is none."""
-    found = QUANTITY.fullmatch(text)
-    if found is None or not is_unit(found[2]):
+    match = QUANTITY.fullmatch(text)
+    if match is None or not is_unit(match[2]):
         return None
-    return float(found[1].replace(",", ".")) * FACTORS.get(found[2], 1.0) / si_factor(name)
+    return float(match[1].replace(",", ".")) * FACTORS.get(match[2], 1.0) / si_factor(name)
 
 
 def is_unit(text: str) -> bool:
@@ -93,9 +93,9 @@ def is_unit(text: str) -> bool:
 
 def split_unit(name: str) -> tuple[str, str]:
     """Return a column's name without its unit, and the unit; empty where it has none that is known."""
-    found = BRACKETED_UNIT.match(name)
-    if found is not None and is_unit(unit := found[2] or found[3]):
-        return found[1], unit
+    match = BRACKETED_UNIT.match(name)
+    if match is not None and is_unit(unit := match[2] or match[3]):
+        return match[1], unit
     loose = BARE_UNIT.match(name)
     # a single letter is a name more often than a unit: joint_A, r_m
     if loose is not None and is_unit(loose[2]) and (len(loose[2]) > 1 or loose[2] in "s°%"):

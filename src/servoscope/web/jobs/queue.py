@@ -68,10 +68,10 @@ class JobQueue:
 
     def submit(self, job: Job) -> JobResponse:
         """Put a job into the queue; raises HTTPException 429 if too many wait."""
-        if sum(one.response.finished is None for one in self._jobs.values()) >= MAX_QUEUED:
+        if sum(job.response.finished is None for job in self._jobs.values()) >= MAX_QUEUED:
             asyncio.get_running_loop().run_in_executor(None, job.discard)
             raise HTTPException(429, "too many jobs wait, try again later", headers={"Retry-After": "10"})
-        for old in [one for one in self._jobs.values() if one.response.finished is not None][: -MAX_FINISHED or None]:
+        for old in [job for job in self._jobs.values() if job.response.finished is not None][: -MAX_FINISHED or None]:
             del self._jobs[old.response.id]
         self._jobs[job.response.id] = job
         job.handle = asyncio.create_task(self._run(job))

@@ -101,8 +101,8 @@ def inspect_file(
 
 def assess_file(progress: Progress, file: str, request: requests.InspectionRequest) -> JsonObject:
     """Return what is most likely wrong with a loop, from one log without a baseline; of several loops of the first."""
-    found = find_loops(open_file(file).columns)
-    columns = _merge_columns(request.columns, None) if request.columns is not None else next(iter(found.values()))
+    loops = find_loops(open_file(file).columns)
+    columns = _merge_columns(request.columns, None) if request.columns is not None else next(iter(loops.values()))
     ((name, samples),) = readers.read_rows(file, columns, request.where).items()
     first = -math.inf if request.from_s is None else request.from_s
     last = math.inf if request.to_s is None else request.to_s
@@ -118,8 +118,8 @@ def propose_file(progress: Progress, file: str, request: requests.ProposalReques
     proposal = init(file, columns)
     recording = readers.read(file, proposal.loop)
     lines = [
-        {"section": one.section, "key": one.key, "value": one.value, "why": str(one.why), "doubtful": one.doubtful}
-        for one in proposal.lines
+        {"section": line.section, "key": line.key, "value": line.value, "why": str(line.why), "doubtful": line.doubtful}
+        for line in proposal.lines
     ]
     found = _inspection_result(inspection.inspect(recording, proposal.loop), recording)
     return {"toml": proposal.to_toml(), "lines": lines, **found}
@@ -228,7 +228,7 @@ def relearn_baseline(
         save=False,
     )
     learned.save(Path(out) / "baseline.json")
-    points = [each.to_dict() for each in compare_baselines(before, learned)]
+    points = [difference.to_dict() for difference in compare_baselines(before, learned)]
     return {"points": points, "notes": [str(note) for note in learned.notes], "duration_s": recording.duration_s}
 
 
@@ -306,8 +306,12 @@ def _trace_columns(trace: Trace, units: Sequence[str]) -> JsonObject:
         for i, f in enumerate(trace.ifrf.frequencies.tolist())
     ]
     parameters = [
-        {"name": name, "unit": unit, **{key: json_numbers(each[at, i]) for key, each in coefficients.items()}}
+        {
+            "name": name,
+            "unit": unit,
+            **{key: json_numbers(coefficient[at, i]) for key, coefficient in coefficients.items()},
+        }
         for i, (name, unit) in enumerate(zip(trace.names, chain(units, repeat("")), strict=False))
     ]
-    columns = {key: json_numbers(each[at]) for key, each in tests.items()}
+    columns = {key: json_numbers(test[at]) for key, test in tests.items()}
     return {**columns, "responses": responses, "parameters": parameters}

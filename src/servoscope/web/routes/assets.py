@@ -69,7 +69,10 @@ def build_asset_detail(context: Context, asset: str, at: float, status: AssetSta
 def list_assets(context: ContextDep, query: Annotated[FleetQuery, Query()]) -> schemas.FleetStatus:
     """List the assets, the most urgent first."""
     statuses = read_statuses(context.store).values()
-    rows = [schemas.AssetRow.from_status(one.name, one.at, status) for one, status in asset_statuses(statuses)]
+    rows = [
+        schemas.AssetRow.from_status(status_entry.name, status_entry.at, status)
+        for status_entry, status in asset_statuses(statuses)
+    ]
     wanted = [
         row
         for row in rows
@@ -82,7 +85,10 @@ def list_assets(context: ContextDep, query: Annotated[FleetQuery, Query()]) -> s
         configured=len(context.config.assets) if context.config is not None else 0,
         assets=sorted(wanted, key=lambda row: (-row.severity, row.asset)),
         groups=sorted({row.group for row in rows if row.group}),
-        services=[schemas.ServiceRow.from_status(one.name, status) for one, status in service_statuses(statuses)],
+        services=[
+            schemas.ServiceRow.from_status(status_entry.name, status)
+            for status_entry, status in service_statuses(statuses)
+        ],
     )
 
 
@@ -177,8 +183,8 @@ def get_trend(context: ContextDep, asset: str, query: Annotated[TrendQuery, Quer
         raise
     except StoreError as error:
         raise HTTPException(404, str(error)) from None
-    found = prognose(series, query.limit)
-    return sizes.Forecast(asset=asset, **dict(found))
+    prognosis = prognose(series, query.limit)
+    return sizes.Forecast(asset=asset, **dict(prognosis))
 
 
 @router.get("/assets/{asset}/limits")

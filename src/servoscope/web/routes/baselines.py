@@ -52,7 +52,7 @@ def asset_baseline_id(context: Context, asset: str) -> str | None:
     if path == config.relearned_file(asset):
         return SERVICE_PREFIX + asset
     file = config.assets[asset].baseline
-    names = (name for name, one in config.assets.items() if one.baseline == file)
+    names = (name for name, asset in config.assets.items() if asset.baseline == file)
     return SERVICE_PREFIX + next(name for name in names if config.baseline_file(name) == path)
 
 
@@ -68,7 +68,7 @@ def find_baseline(context: Context, id_: str) -> BaselineFile:
     if config is None or asset not in config.assets:
         raise HTTPException(404, f"there is no baseline {id_}")
     path, file = config.baseline_file(asset), config.assets[asset].baseline
-    alike = [name for name, one in config.assets.items() if one.baseline == file]
+    alike = [name for name, asset in config.assets.items() if asset.baseline == file]
     sharing = [name for name in alike if config.baseline_file(name) == path]
     facts = _baseline_facts(load_cached(path))
     return BaselineFile(
@@ -125,24 +125,24 @@ def _list_files(context: Context) -> list[BaselineFile]:
 @router.get("/baselines")
 def list_baselines(context: ContextDep) -> responses.BaselineList:
     """List the baselines."""
-    return responses.BaselineList(baselines=[one.row for one in _list_files(context)])
+    return responses.BaselineList(baselines=[baseline_file.row for baseline_file in _list_files(context)])
 
 
 @router.get("/baselines/{id}")
 def get_baseline(context: ContextDep, id: str) -> responses.BaselineDetail:
     """Return a baseline: what was learned, and which faults it can detect."""
-    found = find_baseline(context, id)
-    summary: Any = plain_values.replace_nan(plain_values.baseline_summary(load_cached(found.path)))
-    return responses.BaselineDetail(**dict(found.row), summary=summary)
+    baseline_file = find_baseline(context, id)
+    summary: Any = plain_values.replace_nan(plain_values.baseline_summary(load_cached(baseline_file.path)))
+    return responses.BaselineDetail(**dict(baseline_file.row), summary=summary)
 
 
 @router.get("/baselines/{id}/file", response_class=Response, responses=JSON_RESPONSES)
 def download_baseline(context: ContextDep, id: str) -> Response:
     """Return its file, for `servoscope diagnose`."""
-    found = find_baseline(context, id)
-    load_cached(found.path)
-    name = f"{found.row.name.removesuffix('.json')}.json"
-    return FileResponse(found.path, media_type="application/json", filename=name)
+    baseline = find_baseline(context, id)
+    load_cached(baseline.path)
+    name = f"{baseline.row.name.removesuffix('.json')}.json"
+    return FileResponse(baseline.path, media_type="application/json", filename=name)
 
 
 @router.delete("/baselines/{id}", status_code=HTTP_204_NO_CONTENT)
@@ -162,7 +162,10 @@ def list_loops(context: ContextDep) -> responses.LoopList:
     for name in EXAMPLES:
         text = files("servoscope.simulation").joinpath(f"{name}.toml").read_text(encoding="utf-8")
         rows.append(_loop_row({"example": name}, Loop.from_dict(tomllib.loads(text)), text))
-    rows += [_loop_row({"baseline": one.row.id}, load_cached(one.path).loop, None) for one in _list_files(context)]
+    rows += [
+        _loop_row({"baseline": baseline_file.row.id}, load_cached(baseline_file.path).loop, None)
+        for baseline_file in _list_files(context)
+    ]
     return responses.LoopList(loops=rows)
 
 
@@ -182,7 +185,7 @@ def _loop_row(ref: dict[str, str], loop: Loop, toml: str | None) -> responses.Lo
 @router.post("/learnings", status_code=HTTP_202_ACCEPTED)
 async def start_learning(context: ContextDep, who: Engineer, request: LearningRequest) -> responses.JobResponse:
     """Learn from healthy uploads, and inspect each of them; a job. Its baseline waits to be saved."""
-    uploads = [one.upload for one in request.recordings]
+    uploads = [recording.upload for recording in request.recordings]
     paths = await asyncio.to_thread(context.storage.upload_paths, uploads)
     loop = await asyncio.to_thread(resolve_loop, context, request.loop)
 

@@ -100,7 +100,9 @@ def _asset_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
     document = dict(rows[0]["document"])
     diagnosis = read_diagnosis(document)
     began, signature, _ = document.pop("began", None), document.pop("signature", []), document.pop("said", None)
-    facts = next((one.metadata for _, one in asset_statuses(read_statuses(context.store, [asset]).values())), None)
+    facts = next(
+        (status.metadata for _, status in asset_statuses(read_statuses(context.store, [asset]).values())), None
+    )
     baseline = None
     if facts is not None and facts.model_fields_set:
         # the baseline that the asset has now: the store does not know which one it had then

@@ -62,7 +62,7 @@ async def _event_stream(context: Context, asset: str | None, is_permitted: Calla
             if text := await _changes_since(context, asset, before):
                 sent = True
                 yield text
-        for event in [one for one in hub.events if one.number > number and asset in (None, one.asset)]:
+        for event in [event for event in hub.events if event.number > number and asset in (None, event.asset)]:
             sent = True
             yield event.text
         number = hub.last_number

@@ -68,7 +68,7 @@ async def start_preview(
         context.storage.publish(responses.LearningRow(id=id_, who=who.user, uploads=[asset, file.name]))
         return {"learning": id_, "judged": judged._asdict(), **result}
 
-    sources = [path.parent / source.name for each in before.per_point for source in each.sources]
+    sources = [path.parent / source.name for baseline in before.per_point for source in baseline.sources]
     reads = [str(one) for one in (path, history_folder(path), *sources) if one.exists()]
     arguments = str(path), str(file), request, point, who.user, str(out)
     discard = partial(context.storage.remove, "learnings", id_)
