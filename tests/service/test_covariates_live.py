@@ -16,7 +16,10 @@ from reliability.servers import Mosquitto
 
 import servoscope as ss
 from servoscope.core.errors import MessageError, RecordingError
+from servoscope.service import renewal
+from servoscope.service.assets.checkpoint import StreamPosition
 from servoscope.service.assets.examination import blocks_to_recording
+from servoscope.service.assets.status import AssetStatus
 from servoscope.service.build import build_assets, build_source
 from servoscope.service.config import ServiceFile
 from servoscope.service.mqtt import payload
@@ -216,3 +219,19 @@ def test_a_source_that_carries_none_refuses(folder: Path) -> None:
     told = run("run", hall(folder, "plant", source), "--check")
     assert told.code == 1
     assert "depends on load, which source line does not carry" in told.err
+
+
+def test_recordings_of_what_a_baseline_does_not_hold_are_asked_for(folder: Path) -> None:
+    loads = ss.Baseline.load(folder / "baseline.json")
+    alone = loads.model_copy(update={"covariates": None})
+
+    def offers(verdict: str, baseline: ss.Baseline) -> list[str]:
+        position = StreamPosition(began=0.0, t=7200.0)
+        status = AssetStatus.model_construct(verdict=verdict, since=0.0, position=position, learning=None)
+        return [str(offer) for offer in renewal.offers(baseline, status, 3600.0)]
+
+    asked_for = "The baseline holds load from 1 to 5: healthy recordings beyond that range are missing."
+    assert offers("undetermined", loads) == [asked_for]
+    assert offers("undetermined", alone) == offers("fault", loads) == []
+    assert offers("healthy", loads)[-1] == asked_for
+    assert "60 min" in offers("healthy", alone)[0]

@@ -108,7 +108,8 @@ def forecast_covariance(baseline: Baseline, more: int) -> FloatArray:
         return np.maximum(scatter, carried) if count < known.carried_from else scatter
 
     noise = np.maximum(np.diag(C) - ahead(m), MIN_NOISE_SHARE * np.diag(C))
-    return C + np.diag(noise * m / (m + more) + ahead(m + more) - np.diag(C))
+    scale = np.sqrt((noise * m / (m + more) + ahead(m + more)) / np.diag(C))
+    return np.asarray(C * np.outer(scale, scale))  # with the correlations that there are: it stays positive definite
 
 
 def learn_thresholds(

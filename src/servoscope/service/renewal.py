@@ -67,9 +67,15 @@ def learning_progress(
 def offers(baseline: Baseline, status: AssetStatus, kept_s: float) -> list[Message]:
     """Return what further healthy recordings would bring, and how long a healthy stretch is at hand.
 
-    `baseline`: the one in force, of the asset's operating point. Nothing is offered while something is wrong.
+    `baseline`: the one in force, of the asset's operating point. Nothing is offered while something is wrong; where
+    the conditions are new, recordings of them are asked for.
     """
     healthy_s = min(status.position.t - status.since, kept_s)
+    model = baseline.covariates if baseline.logged_covariates else None
+    ranges = [] if model is None else zip(model.names, model.low, model.high, strict=True)
+    asked = [message("service.renewal.range", name=name, low=low, high=high) for name, low, high in ranges]
+    if status.verdict == "undetermined" and status.learning is None:
+        return asked
     if status.verdict != "healthy" or status.learning is not None or healthy_s < min(MIN_LEARN_S, kept_s):
         return []
     messages = [message("service.renewal.ready", minutes=healthy_s / 60.0)]
@@ -79,7 +85,7 @@ def offers(baseline: Baseline, status: AssetStatus, kept_s: float) -> list[Messa
         if name and changes[name][1] < MAX_OFFERED_RATIO * changes[name][0]:
             before, after = (100.0 * size for size in changes[name])
             messages.append(message("service.renewal.offer", more=more, fault=name, before=before, after=after))
-    return messages
+    return [*messages, *asked]
 
 
 def stored_stretch(
