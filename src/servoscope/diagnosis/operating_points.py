@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -153,6 +155,8 @@ def _judge_whole(baseline: Baseline, whole: Sequence[Recording], learned: Sequen
     """Return what recordings are as a whole to a baseline that was learned from stretches of them."""
     if sum(recording.samples for recording in learned) < sum(recording.samples for recording in whole):
         gc.collect()  # what learning leaves in circles, a hundred megabytes, would add to what a long diagnosis takes
+        with suppress(AttributeError, OSError, TypeError):  # only the GNU C library keeps it, and gives it back so
+            ctypes.CDLL(None).malloc_trim(0)
     return [
         message(
             "learning.stretches",

@@ -63,7 +63,7 @@ def asset_table(statuses: Mapping[str, Mapping[str, Any]], width: int) -> Table:
             *((ne107, format_timestamp(status["counted"]["t"]), say("cli.ago", duration=age)) if wide else ()),
         )
         rows.append(cells)
-    return build_table(head, rows)
+    return build_table(head, rows, unbroken={*head} - {"alarms"})
 
 
 def commissioning_table(rows: Sequence[CommissioningRow]) -> Table:
@@ -78,7 +78,8 @@ def commissioning_table(rows: Sequence[CommissioningRow]) -> Table:
         shown.append(
             (Text(row.asset), Text(row.source), heard, str(row.blocks), *rates, when, row.reception.why or DASH)
         )
-    return build_table(("asset", "source", "heard", "blocks", "Hz", "needed", "newest sample", "what is wrong"), shown)
+    head = ("asset", "source", "heard", "blocks", "Hz", "needed", "newest sample", "what is wrong")
+    return build_table(head, shown, unbroken=head[:-1])
 
 
 def service_lines(statuses: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -141,7 +142,8 @@ def row_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> Tabl
     """Return a table of some columns of rows; times as dates."""
     subjects = ({**row, "subject": _delivery_subject(row)} if "subject" in columns else row for row in rows)
     cells = [[_format_cell(name, row.get(name)) for name in columns] for row in subjects]
-    return build_table([plain_name(name) for name in columns], cells)
+    unbroken = [plain_name(name) for name in columns if name in (*TIME_COLUMNS, "asset")]
+    return build_table([plain_name(name) for name in columns], cells, unbroken=unbroken)
 
 
 def _delivery_subject(row: Mapping[str, Any]) -> str:

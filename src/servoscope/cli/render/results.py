@@ -5,9 +5,9 @@ from __future__ import annotations
 import errno
 import math
 import shlex
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from unicodedata import category
 
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -68,11 +68,20 @@ def print_title(out: Console, name: str, text: str) -> None:
     out.print(Text.assemble((name, "bold"), text))
 
 
-def build_table(header: Sequence[str], rows: Iterable[Sequence[str | Text]], words: int | None = None) -> Table:
-    """Return a table whose first `words` columns, None: all, are text and whose others are numbers."""
+def build_table(
+    header: Sequence[str],
+    rows: Iterable[Sequence[str | Text]],
+    words: int | None = None,
+    unbroken: Collection[str] = (),
+) -> Table:
+    """Return a table whose first `words` columns, None: all, are text and whose others are numbers.
+
+    `unbroken`: the columns that are never broken into lines.
+    """
     grid = Table(box=None, padding=(0, 2, 0, 0), header_style="dim", show_edge=False)
     for i, name in enumerate(header):
-        grid.add_column(translate(name), justify="left" if words is None or i < words else "right", overflow="fold")
+        justify: Literal["left", "right"] = "left" if words is None or i < words else "right"
+        grid.add_column(translate(name), justify=justify, overflow="fold", no_wrap=name in unbroken)
     for row in rows:
         grid.add_row(*(Text(translate_range(cell)) if isinstance(cell, str) else cell for cell in row))
     return grid
