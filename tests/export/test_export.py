@@ -323,9 +323,7 @@ class TestRefusals:
             export_c(fresh(demo().model_copy(update={"loop_settings": settings})))
 
     def test_features(self) -> None:
-        with pytest.raises(
-            BaselineError, match=r"features cannot be exported.*= 0, or give --only-coef"
-        ):
+        with pytest.raises(BaselineError, match=r"features cannot be exported.*= 0, or give --only-coef"):
             export_c(with_features())
 
     def test_operating_points(self) -> None:
