@@ -127,7 +127,7 @@ def test_text_in_a_column_that_is_not_used_does_not_matter(tmp_path: Path) -> No
 
 def test_a_missing_column_names_the_nearest(tmp_path: Path) -> None:
     text = refusal(written(tmp_path, lines(Velocity=[0] * 300)), columns=Columns(output="velocty"))
-    assert "[columns] output: no column 'velocty', did you mean Velocity?" in text
+    assert "[columns] output: no column 'velocty', did you mean Velocity, y?" in text
 
 
 def test_upper_and_lower_case_differ(tmp_path: Path) -> None:
