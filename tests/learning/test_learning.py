@@ -273,3 +273,8 @@ def test_a_rehearsal_is_as_long_as_the_memory_asks(rig: dict[str, Any], record: 
         loop = Loop.from_dict(rig | {"monitor": {"memory": memory}})
         shares.append(learn_baseline(loop, [record(loop, seconds=240.0)]).thresholds.calibration.statistic)
     assert shares[1] == pytest.approx(shares[0], rel=0.5)
+
+
+def test_nothing_to_learn_from_is_said() -> None:
+    with pytest.raises(NotEnoughError, match="give at least one healthy recording"):
+        operating_points.learn(Loop.from_dict({"name": "axis", "sample_rate": 100.0, "plant": {"kind": "axis"}}), [])

@@ -142,31 +142,31 @@ def learn(
 
 def _thin_out(loop: Loop, recordings: Sequence[Recording]) -> list[Recording]:
     """Return recordings of a bounded length in all; long ones are stretches of what they were."""
-    share = MAX_SAMPLES / sum(rec.samples for rec in recordings)
-    if share >= 1.0:
+    samples = sum(rec.samples for rec in recordings)
+    if samples <= MAX_SAMPLES:
         return list(recordings)
     # how a machine warms up shows in a whole beginning only
     memories = math.inf if loop.monitor.hidden_warm_up else MIN_MEMORIES
     shortest = round(min(memories * loop.monitor.memory * loop.sample_rate, MAX_SAMPLES))
-    return [thin_out(rec, math.ceil(share * rec.samples), shortest) for rec in recordings]
+    return [thin_out(rec, math.ceil(MAX_SAMPLES / samples * rec.samples), shortest) for rec in recordings]
 
 
 def _judge_whole(baseline: Baseline, whole: Sequence[Recording], learned: Sequence[Recording]) -> list[Message]:
     """Return what recordings are as a whole to a baseline that was learned from stretches of them."""
-    if sum(recording.samples for recording in learned) < sum(recording.samples for recording in whole):
+    longer = [(rec, part) for rec, part in zip(whole, learned, strict=True) if part.samples < rec.samples]
+    if longer:
         gc.collect()  # what learning leaves in circles, a hundred megabytes, would add to what a long diagnosis takes
         with suppress(AttributeError, OSError, TypeError):  # only the GNU C library keeps it, and gives it back so
             ctypes.CDLL(None).malloc_trim(0)
     return [
         message(
             "learning.stretches",
-            recording=recording.name,
+            recording=rec.name,
             rows=part.samples,
-            of=recording.samples,
-            found=diagnosis.headline,
+            of=rec.samples,
+            found=diagnose(baseline, rec).headline,
         )
-        for recording, part in zip(whole, learned, strict=True)
-        if part.samples < recording.samples and (diagnosis := diagnose(baseline, recording))
+        for rec, part in longer
     ]
 
 
