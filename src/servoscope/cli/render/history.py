@@ -13,6 +13,7 @@ from rich.text import Text
 
 from servoscope.cli.render.results import COLOURS, build_table
 from servoscope.core.messages import translate
+from servoscope.core.number_format import format_rough
 from servoscope.report.format_values import DASH, format_duration, plain_name
 from servoscope.report.page import say
 from servoscope.service.store.queries import format_time
@@ -125,7 +126,7 @@ def format_relative_residual(residual: Sequence[float | None] | None) -> str:
     if residual is None or None in residual or not residual[2]:
         return DASH
     real, imaginary, healthy = (float(part or 0.0) for part in residual)
-    return f"{100.0 * math.hypot(real, imaginary) / healthy:.2g} %"
+    return f"{format_rough(100.0 * math.hypot(real, imaginary) / healthy)} %"
 
 
 def active_alarms(statuses: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -18,6 +18,7 @@ from rich.text import Text
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.messages import translate, translate_range
+from servoscope.core.number_format import format_rough
 from servoscope.learning.inspection import Inspection
 from servoscope.models.loop import Columns
 from servoscope.report.format_values import DASH, format_duration, format_percent
@@ -142,7 +143,7 @@ def _print_operating_point(out: Console, b: Baseline) -> None:
     print_title(out, translate("Baseline") if unnamed else b.loop.name, title)
     std = [math.sqrt(b.covariance[i][i]) for i in range(len(b.theta))]
     rows = [
-        (name, f"{value:.5g}", f"{s:.2g}", f"{100.0 * abs(s / value):.2g} %" if value else DASH)
+        (name, f"{value:.5g}", f"{s:.2g}", f"{format_rough(100.0 * abs(s / value))} %" if value else DASH)
         for name, value, s in zip(b.names, b.theta, std, strict=True)
     ]
     changes = b.detectability.changes
