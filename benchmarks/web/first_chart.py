@@ -11,9 +11,7 @@ more on a busy machine.
 from __future__ import annotations
 
 import os
-import re
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -28,9 +26,8 @@ import numpy as np  # noqa: E402
 from playwright.sync_api import sync_playwright  # noqa: E402
 from tables import Table, parser, show  # noqa: E402
 
-from web import store  # noqa: E402
-from web.load import SOURCE, usage  # noqa: E402
-from web.years import PAGE, fill  # noqa: E402
+from web.load import usage  # noqa: E402
+from web.years import PAGE, fill, serve  # noqa: E402
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 DRAWN = """() => [...document.querySelectorAll("canvas")].some((c) => c.width && c.height
@@ -81,17 +78,10 @@ def main() -> None:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         fill(folder, given.assets)
-        two = (folder / "two.toml").read_text(encoding="utf-8")
-        (folder / "hall.toml").write_text(two.replace("two.sqlite", store.FILE), encoding="utf-8")
-        serve = [sys.executable, "-m", "servoscope", "serve", "hall.toml", "--listen", "127.0.0.1:0"]
-        environment = {**os.environ, "PYTHONPATH": str(SOURCE)}
-        server = subprocess.Popen(serve, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True)
-        stack.callback(lambda: (server.terminate(), server.wait(30)))
-        assert server.stderr is not None
-        address = next(found[1] for line in server.stderr if (found := re.match(r"servoscope: (https?://\S+)/ ", line)))
+        pid, address = serve(folder, stack)
         client = stack.enter_context(httpx.Client(base_url=address, timeout=60.0))
-        answers(client, server.pid, 1)  # what the first one imports
-        waits, used = answers(client, server.pid, given.assets)
+        answers(client, pid, 1)  # what the first one imports
+        waits, used = answers(client, pid, given.assets)
         first_charts(address, 1)  # the browser's own start
         charts, drawn = first_charts(address, given.looks)
     spread = "{:.2f} s, {:.2f} s, {:.2f} s"

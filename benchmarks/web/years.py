@@ -108,6 +108,19 @@ def measure(client: httpx.Client, pid: int, paths: tuple[str, ...]) -> str:
     return f"{statistics.median(times):.2f} s, {statistics.median(used):.2f} s"
 
 
+def serve(folder: Path, stack: ExitStack) -> tuple[int, str]:
+    """Serve what `fill` has written until the stack ends; return the server's process and address."""
+    two = (folder / "two.toml").read_text(encoding="utf-8")
+    (folder / "hall.toml").write_text(two.replace("two.sqlite", store.FILE), encoding="utf-8")
+    command = [sys.executable, "-m", "servoscope", "serve", "hall.toml", "--listen", "127.0.0.1:0"]
+    environment = {**os.environ, "PYTHONPATH": str(SOURCE)}
+    server = subprocess.Popen(command, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True)
+    stack.callback(lambda: (server.terminate(), server.wait(30)))
+    assert server.stderr is not None
+    address = next(found[1] for line in server.stderr if (found := re.match(r"servoscope: (https?://\S+)/ ", line)))
+    return server.pid, address
+
+
 def main() -> None:
     """Fill a store, serve it, measure, print."""
     command = parser(__doc__)
@@ -117,18 +130,11 @@ def main() -> None:
     with ExitStack() as stack:
         folder = given.keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         before, after, thinning = fill(folder, given.assets)
-        two = (folder / "two.toml").read_text(encoding="utf-8")
-        (folder / "hall.toml").write_text(two.replace("two.sqlite", store.FILE), encoding="utf-8")
-        serve = [sys.executable, "-m", "servoscope", "serve", "hall.toml", "--listen", "127.0.0.1:0"]
-        environment = {**os.environ, "PYTHONPATH": str(SOURCE)}
-        server = subprocess.Popen(serve, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True)
-        stack.callback(lambda: (server.terminate(), server.wait(30)))
-        assert server.stderr is not None
-        address = next(found[1] for line in server.stderr if (found := re.match(r"servoscope: (https?://\S+)/ ", line)))
+        pid, address = serve(folder, stack)
         client = stack.enter_context(httpx.Client(base_url=address, timeout=60.0))
-        page = measure(client, server.pid, (*PAGE, "/trend?limit=2"))
-        series = measure(client, server.pid, ("/sizes?of=faults&points=600",))
-        trend = measure(client, server.pid, ("/trend?limit=1.5",))
+        page = measure(client, pid, (*PAGE, "/trend?limit=2"))
+        series = measure(client, pid, ("/sizes?of=faults&points=600",))
+        trend = measure(client, pid, ("/trend?limit=1.5",))
         rows = (
             ("rows of an asset, as written and thinned", f"{before}, {after}"),
             ("thinning an asset's year at once", f"{thinning:.2f} s"),
