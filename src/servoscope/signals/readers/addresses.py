@@ -21,7 +21,7 @@ ENTRY_POINTS = "servoscope.tables"  # name is what an address begins with, objec
 BUILT_IN = tuple(  # written like the entry points of other packages, and loaded like them
     EntryPoint(name, f"servoscope.signals.readers.{value}", ENTRY_POINTS)
     for name, value in (
-        ("join", "joined:open_joined"),
+        ("join", "concatenation:open_concatenation"),
         ("mqtt", "topic:open_topic"),
         ("sql", "sql:open_sql"),
         ("influx", "influx:open_influx"),

@@ -12,7 +12,7 @@ from servoscope.signals.readers.formats import open_file, readable_suffixes
 from servoscope.signals.readers.table import Table, TableFile
 
 
-def open_joined(address: TableAddress) -> TableFile:
+def open_concatenation(address: TableAddress) -> TableFile:
     """Open the files of a folder, a pattern or a list with commas, in the order of the numbers in their names.
 
     Raises RecordingError if there are none, or one cannot be read; if a column that is used is not in all of them.
