@@ -7,9 +7,10 @@ All take equidistant samples without gaps, shape (N,), and a period in samples. 
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from scipy import signal
 
 from servoscope.core.arrays import FloatArray
@@ -49,8 +50,7 @@ def find_oscillation(x: FloatArray) -> Oscillation | None:
         return None
     peak = frequency[int(np.argmax(smooth))]
     whole = np.fft.rfft(x)
-    inside = (frequency > peak / 2.0) & (frequency < 2.0 * peak)
-    band = np.fft.irfft(np.where(inside, whole, 0.0), n)
+    band = _octave(whole, frequency / peak, n)
     padded = np.fft.rfft(band, 2 * n)
     rho = np.fft.irfft(np.abs(padded) ** 2)[: n // 2]
     crossings = np.flatnonzero(rho[:-1] * rho[1:] < 0.0)[: MAX_INTERVALS + 1]
@@ -66,9 +66,12 @@ def find_oscillation(x: FloatArray) -> Oscillation | None:
 
 def octave_around(x: FloatArray, period: float) -> FloatArray:
     """Return a signal within an octave around a period [samples]."""
-    spectrum = np.fft.rfft(signal.detrend(x))
-    frequency = np.fft.rfftfreq(x.size) * period
-    return np.asarray(np.fft.irfft(np.where((frequency > 0.5) & (frequency < 2.0), spectrum, 0.0), x.size))
+    return _octave(np.fft.rfft(signal.detrend(x)), np.fft.rfftfreq(x.size) * period, x.size)
+
+
+def _octave(spectrum: npt.NDArray[np.complex128], relative: npt.NDArray[np.floating[Any]], samples: int) -> FloatArray:
+    """Return what a spectrum holds within an octave around its relative frequency 1, as a signal."""
+    return np.asarray(np.fft.irfft(np.where((relative > 0.5) & (relative < 2.0), spectrum, 0.0), samples))
 
 
 def smooth_to(x: FloatArray, period: float, harmonics: float = 7.0) -> FloatArray:

@@ -83,6 +83,19 @@ def compare_models(u: FloatArray, y: FloatArray, period: float, scales: Sequence
     low, high = np.quantile(u, [0.01, 0.99])
     span = max(float(high - low), 1e-12)
     bands = np.array([(s * span, 0.0, 0.0) for s in SIZES_OF_BAND])
+    grid = np.concatenate([_search_slips(u, y, period, scales, span), bands])
+    lanes = _positions(u, grid)
+    edges = np.quantile(u, [*CLIPS, *(1.0 - q for q in CLIPS)])
+    clipped = [np.minimum(u, edge) if i < len(CLIPS) else np.maximum(u, edge) for i, edge in enumerate(edges)]
+    plain = np.stack([u, *clipped])
+    return [
+        _compare(thin(lanes, scale), thin(plain, scale), thin(y, scale), period / scale, grid, edges)
+        for scale in scales
+    ]
+
+
+def _search_slips(u: FloatArray, y: FloatArray, period: float, scales: Sequence[int], span: float) -> FloatArray:
+    """Return the likeliest S, J/S and first positions, shape (K, 3): on a grid, then around its best points."""
     grid = np.array([(s * span, j, phase) for s in SIZES for j in JUMPS for phase in PHASES])
     coarse = scales[min(1, len(scales) - 1)]  # where the likelihood is smooth, and cheap
     kept = []
@@ -101,15 +114,7 @@ def compare_models(u: FloatArray, y: FloatArray, period: float, scales: Sequence
             steps = 0.5 * steps
         grid = grid[np.argsort(variances)[: 8 * KEPT]]
         kept.append(grid[:KEPT])
-    grid = np.concatenate([*kept, bands])
-    lanes = _positions(u, grid)
-    edges = np.quantile(u, [*CLIPS, *(1.0 - q for q in CLIPS)])
-    clipped = [np.minimum(u, edge) if i < len(CLIPS) else np.maximum(u, edge) for i, edge in enumerate(edges)]
-    plain = np.stack([u, *clipped])
-    return [
-        _compare(thin(lanes, scale), thin(plain, scale), thin(y, scale), period / scale, grid, edges)
-        for scale in scales
-    ]
+    return np.concatenate(kept)
 
 
 def _positions(u: FloatArray, grid: FloatArray) -> FloatArray:

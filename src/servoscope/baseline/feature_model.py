@@ -100,15 +100,10 @@ class FeatureModel(_FeatureRecord):
 
         None where the earlier one has other features: a short stretch alone does not show how healthy days differ.
         """
-        if (
-            earlier is None
-            or earlier.covariates
-            or (earlier.layout.bands_hz, earlier.layout.edges_s)
-            != (
-                self.layout.bands_hz,
-                self.layout.edges_s,
-            )
-        ):
+        if earlier is None or earlier.covariates:
+            return None
+        here, there = self.layout, earlier.layout
+        if (here.bands_hz, here.edges_s) != (there.bands_hz, there.edges_s):
             return None
         known = {(group.level, group.past, group.kept): np.array(group.means) for group in earlier.groups}
         groups = []
