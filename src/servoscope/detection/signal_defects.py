@@ -84,11 +84,11 @@ def find_signal_defect(recording: Recording, delay_s: float = 0.0) -> SignalDefe
     for chunk in outofcore.iter_chunks(0, recording.samples):
         rows = recording.rows(chunk)
         state, findings = check_block(limits, state, rows.t, rows.r, rows.u, rows.y)
-        signal_defect = [_frozen_defect(recording, finding) for finding in findings] + [
+        candidates = [_frozen_defect(recording, finding) for finding in findings] + [
             _find_jump(rows, chunk.start, lead)
         ]
         outofcore.release(*recording.columns)
-        if defects := [defect for defect in signal_defect if defect is not None]:
+        if defects := [defect for defect in candidates if defect is not None]:
             return min(defects, key=lambda defect: defect.begin)
     return None
 

@@ -94,17 +94,17 @@ class Population:
                     f"{name}: its coefficients ({', '.join(other.names)}; plant {other.loop.plant.kind}) are not those "
                     f"of {first_name} ({', '.join(first.names)}; plant {first.loop.plant.kind}): no like machine"
                 )
-        baseline = list(baselines.values())
-        scatter, degrees = _common_scatter(baseline, len(first.names))
-        theta = np.array([baseline.theta for baseline in baseline])
-        errors = np.array([_estimation_error(baseline, scatter) for baseline in baseline])
+        machines = list(baselines.values())
+        scatter, degrees = _common_scatter(machines, len(first.names))
+        theta = np.array([baseline.theta for baseline in machines])
+        errors = np.array([_estimation_error(baseline, scatter) for baseline in machines])
         return cls(
-            len(baseline),
+            len(machines),
             NormalPrior.from_machines(first.names, theta, errors),
-            _ratios(baseline),
+            _ratios(machines),
             scatter,
             degrees,
-            2 * sum(bool(baseline.thresholds.hypotheses) for baseline in baseline) > len(baseline),
+            2 * sum(bool(baseline.thresholds.hypotheses) for baseline in machines) > len(machines),
         )
 
     def pooled_scatter(self, own: FloatArray, recordings: int) -> FloatArray:

@@ -160,8 +160,8 @@ class Notifier:
                 snapshots = {name: AssetSnapshot(buffered=fill_ratio, cause=cause)}
             for key, snapshot in snapshots.items():
                 before = own.get(key) or initial_alarm_state(self.name, key, now)
-                own[key], alarm_transition = step_alarm(definition, before, snapshot, now)
-                transitions += alarm_transition
+                own[key], further = step_alarm(definition, before, snapshot, now)
+                transitions += further
         return self._step_result(transitions)
 
     def execute(self, alarm: str, command: OperatorCommand, now: float) -> StepResult:

@@ -33,17 +33,17 @@ def find_other_causes(refined: RefitResult, since: ChangeProfile | None = None) 
     those as good as it, if they explain nearly all that the healthy plant does not.
     """
     window, best, causes = refined.window, refined.best.fitted, CauseWindow(refined.window)
-    other_cause = _all_causes(refined, causes, since or best.profile)
+    others = _all_causes(refined, causes, since or best.profile)
     limit = best.cost
     if refined.is_unknown:
         if since is None:  # the onset of an explanation that is none may mean nothing
             earlier = _all_causes(refined, causes, ChangeProfile(refined.initial_onset))
-            other_cause = min(other_cause, earlier, key=lambda each: min(cause.cost for cause in each))
+            others = min(others, earlier, key=lambda each: min(cause.cost for cause in each))
         most = window.samples + (1.0 - MIN_EXPLAINED_SHARE) * (causes.healthy_cost - window.samples)
         enough = min(max(most, MAX_WHITE_VARIANCE * window.samples), best.cost)
-        limit = min([cause.cost for cause in other_cause if enough >= cause.cost], default=-np.inf)
+        limit = min([cause.cost for cause in others if enough >= cause.cost], default=-np.inf)
     return sorted(
-        (c for c in other_cause if limit + FIT_TOLERANCE * refined.noise_variance >= c.cost),
+        (c for c in others if limit + FIT_TOLERANCE * refined.noise_variance >= c.cost),
         key=lambda cause: cause.cost,
     )
 

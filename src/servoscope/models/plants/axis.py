@@ -155,9 +155,9 @@ class AxisPlant(TermPlant):
     @property
     def columns(self) -> tuple[TermColumn, ...]:
         """The columns of all terms and of the inertia, powers of s first."""
-        term_column = [column for term in TERMS if term in self.terms for column in TERMS[term]]
-        powers = [column for column in term_column if isinstance(column.column, int)]
-        return (*powers, TermColumn("inertia", 2, 1), *(column for column in term_column if column not in powers))
+        columns = [column for term in TERMS if term in self.terms for column in TERMS[term]]
+        powers = [column for column in columns if isinstance(column.column, int)]
+        return (*powers, TermColumn("inertia", 2, 1), *(column for column in columns if column not in powers))
 
     @property
     def derivative(self) -> int:

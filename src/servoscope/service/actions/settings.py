@@ -200,24 +200,15 @@ class ActionSettings(Settings):
         twice = [name for name, count in Counter(chain(*(getattr(self, key) for key in SINKS))).items() if count > 1]
         if twice:
             raise ValueError(f"{min(twice)!r} names two of {SINK_NAMES}, rename one")
-        for name, fault_tolerance_settings in self.tolerance.items():
-            if fault_tolerance_settings.sink is not None and (
-                fault_tolerance_settings.sink in self.email or fault_tolerance_settings.sink not in self.sinks
-            ):
-                raise ValueError(
-                    f"tolerance.{name}: sink: no webhook, command or mqtt is called {fault_tolerance_settings.sink!r}"
-                )
+        for name, action in self.tolerance.items():
+            if action.sink is not None and (action.sink in self.email or action.sink not in self.sinks):
+                raise ValueError(f"tolerance.{name}: sink: no webhook, command or mqtt is called {action.sink!r}")
         return self
 
     def with_network(self, network: NetworkSettings) -> ActionSettings:
         """Return the same with rules for those that have none of their own."""
-        brokers = apply_network(
-            {name: mqtt_message_settings.broker for name, mqtt_message_settings in self.mqtt.items()}, network
-        )
-        mqtt = {
-            name: mqtt_message_settings.model_copy(update={"broker": brokers[name]})
-            for name, mqtt_message_settings in self.mqtt.items()
-        }
+        brokers = apply_network({name: sink.broker for name, sink in self.mqtt.items()}, network)
+        mqtt = {name: sink.model_copy(update={"broker": brokers[name]}) for name, sink in self.mqtt.items()}
         webhook, email = apply_network(self.webhook, network), apply_network(self.email, network)
         return self.model_copy(update={"webhook": webhook, "mqtt": mqtt, "email": email})
 
@@ -239,7 +230,7 @@ class ActionSettings(Settings):
     @property
     def executing(self) -> set[str | None]:
         """Names of the sinks that change a machine, and are not tried therefore."""
-        return {fault_tolerance_settings.sink for fault_tolerance_settings in self.tolerance.values()}
+        return {action.sink for action in self.tolerance.values()}
 
     @property
     def sinks(self) -> dict[str, Sink]:

@@ -77,14 +77,14 @@ def advance_alarms(
 
     An alarm that suppresses others comes before them there, so that both happen at the same moment.
     """
-    new, alarm_transition = dict(states), list[AlarmTransition]()
+    new, advanced = dict(states), list[AlarmTransition]()
     for name, definition in definitions.items():
         active = tuple(other for other, alarm_state in new.items() if alarm_state.active)
         if update is not None and update.alarms != active:
             update = replace(update, alarms=active)
         new[name], transitions = step_alarm(definition, new[name], update, time)
-        alarm_transition += transitions
-    return new, tuple(sorted(alarm_transition, key=lambda one: one.time))
+        advanced += transitions
+    return new, tuple(sorted(advanced, key=lambda one: one.time))
 
 
 def next_event_time(definitions: Mapping[str, AlarmDefinition], states: Mapping[str, AlarmState]) -> float:

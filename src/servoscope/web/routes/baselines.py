@@ -52,7 +52,7 @@ def asset_baseline_id(context: Context, asset: str) -> str | None:
     if path == config.relearned_file(asset):
         return SERVICE_PREFIX + asset
     file = config.assets[asset].baseline
-    names = (name for name, asset in config.assets.items() if asset.baseline == file)
+    names = (name for name, settings in config.assets.items() if settings.baseline == file)
     return SERVICE_PREFIX + next(name for name in names if config.baseline_file(name) == path)
 
 
@@ -68,7 +68,7 @@ def find_baseline(context: Context, id_: str) -> BaselineFile:
     if config is None or asset not in config.assets:
         raise HTTPException(404, f"there is no baseline {id_}")
     path, file = config.baseline_file(asset), config.assets[asset].baseline
-    alike = [name for name, asset in config.assets.items() if asset.baseline == file]
+    alike = [name for name, settings in config.assets.items() if settings.baseline == file]
     sharing = [name for name in alike if config.baseline_file(name) == path]
     facts = _baseline_facts(load_cached(path))
     return BaselineFile(
