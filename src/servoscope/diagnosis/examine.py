@@ -175,10 +175,11 @@ class Examination:
 
     @property
     def _changed(self) -> npt.NDArray[np.bool_]:
-        """Whether a change within the recording had been detected, shape (K,)."""
-        found = self.estimates.index >= (self.recording.samples if self.change is None else self.change.detected)
-        found[-1:] |= self.change is not None  # it may be detected after the last evaluation
-        return np.asarray(found)
+        """Whether a change within the recording had been detected, or was not yet repaired, shape (K,)."""
+        change, index = self.change, self.estimates.index
+        if change is None or change.repaired:
+            return np.asarray(index < (0 if change is None else change.onset))
+        return np.asarray(index >= index[-1:].min(initial=change.detected))  # or detected after the last evaluation
 
     @cached_property
     def alarm(self) -> npt.NDArray[np.bool_]:
@@ -394,7 +395,5 @@ def _has_failed_instrument(exam: Examination) -> bool:
 
 
 def _skipped_share(estimates: Estimates) -> float:
-    if not len(estimates.updates):
-        return 0.0
-    skipped, updated = float(estimates.skipped[-1]), float(estimates.updates[-1])
+    skipped, updated = (float(count[-1:].sum()) for count in (estimates.skipped, estimates.updates))
     return skipped / max(skipped + updated, 1.0)
