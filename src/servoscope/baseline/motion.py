@@ -52,11 +52,12 @@ class RecordedMotion:
     """The motion of a recording around each of its K evaluations, from sums over all samples that updated the estimate.
 
     `sums`, shape (K + 1, 1 + 6 + n n): their number, squares of position, speed and acceleration of r and of y behind
-    the loop's filter, and phi phi'.
+    the loop's filter, and phi phi'. `updates`, shape (K + 1,): their number, side by side in memory for a search.
     """
 
     pipeline: Pipeline
     sums: FloatArray
+    updates: FloatArray
 
     @classmethod
     def from_recording(cls, pipeline: Pipeline, recording: Recording, origin: float) -> RecordedMotion:
@@ -65,21 +66,26 @@ class RecordedMotion:
         n, every = pipeline.bank.n, pipeline.every
         evaluations = recording.samples // every
         sums = outofcore.empty((evaluations + 2, 1 + SIGNALS * MOMENTS + n * n))
-        sums[:] = 0.0
+        for rows in outofcore.iter_chunks(0, len(sums), sums):
+            sums[rows] = 0.0
         for rows in outofcore.iter_chunks(0, recording.samples):
             part = recording.rows(rows)
             columns = motion_columns(runners, part.r, part.u, part.y, part.restart, origin)
             which = np.arange(rows.start, rows.stop) // every
             first = np.flatnonzero(np.diff(which, prepend=-1))
             sums[which[first] + 1] += np.add.reduceat(columns, first, axis=0)
-            outofcore.release(*recording.columns)
-        np.cumsum(sums, axis=0, out=sums)
-        return cls(pipeline, sums[: evaluations + 1])
+            outofcore.release(*recording.columns, sums)
+        before = np.zeros(sums.shape[1])
+        for rows in outofcore.iter_chunks(0, len(sums), sums):
+            sums[rows] = before + np.cumsum(sums[rows], axis=0)
+            before = sums[rows.stop - 1].copy()
+        sums = sums[: evaluations + 1]
+        return cls(pipeline, sums, outofcore.copy_column(sums[:, 0]))
 
     def _means(self, at: slice, memories: float, centred: bool) -> tuple[FloatArray, FloatArray]:
         """Return means over the window of each of some evaluations, and the samples in it."""
-        updates, length = self.sums[:, 0], memories * self.pipeline.memory
-        end = np.arange(1, len(self.sums))[at]
+        updates, length = self.updates, memories * self.pipeline.memory
+        end = np.arange(*at.indices(len(updates) - 1)) + 1
         if centred:  # at the ends of a recording the window stays as long as it is
             upper = np.clip(updates[end] + length / 2.0, length, updates[-1])
             end = np.minimum(np.searchsorted(updates, upper), len(updates) - 1)

@@ -123,6 +123,13 @@ class Examination:
         C = np.broadcast_to(self.covariance(self.evaluations - 1), self.estimates.S.shape)
         return bool(t2_statistic(theta, np.broadcast_to(theta[-1], theta.shape), C).max() > MAX_COVARIATE_T2)
 
+    def release(self) -> None:
+        """Free the memory of a recording and of estimates that lie in files; they are read again where needed."""
+        moved = () if self.motion is None else (self.motion.sums, self.motion.updates)
+        outofcore.release(
+            *self.recording.columns, *vars(self.estimates).values(), self.statistic, self.expected, *moved
+        )
+
     @property
     def evaluations(self) -> int:
         """Their number K."""
@@ -193,6 +200,7 @@ class Examination:
             # the sequential test knows no model error
             exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & (self.motion_excess(at) < UNSEEN_EXCESS))
         exceeded &= any_exceeded(self._of_coefficients)
+        self.release()
         return self._changed | apply_alarm_delays(exceeded, *self.pipeline.delays)
 
     @cached_property
@@ -206,7 +214,11 @@ class Examination:
         seen = self.baseline.limited_motion
         if self.motion is None or seen is None:
             return np.zeros(len(self.statistic[at]))
-        return np.asarray(np.abs(self.motion.excess(seen, at)).max(axis=1))
+        first, end, _ = at.indices(self.evaluations)
+        excess = np.zeros(max(end - first, 0))
+        for rows in outofcore.iter_chunks(first, end, self.motion.sums, at_once=AT_ONCE):
+            excess[rows.start - first : rows.stop - first] = np.abs(self.motion.excess(seen, rows)).max(axis=1)
+        return excess
 
     def model_error(self, at: slice) -> FloatArray:
         """Return what a motion never seen adds to the covariance at some evaluations, shape (K, n, n)."""
