@@ -21,13 +21,15 @@ from servoscope.estimation.arm_regression import ANGLE_STEP, ArmSignals
 from servoscope.models.arm.model import FRICTION, ArmModel
 from servoscope.models.arm.settings import ArmLoop
 
-VERSION = 1
+VERSION = 2
 HEAD_LENGTH = 200  # characters, in which a baseline says what it is
 UNKNOWN = "unknown"
 PAYLOAD = ("m", "mx", "my", "mz")
 # standard deviations of a change, by kind: kg and kg m of a payload, rad of an encoder, shares of friction, of the
 # joint's rms torque, of the drive gain, of the load on a joint
 PAYLOAD_SIZES = (2.0, 0.5, 0.5, 0.5)
+# of friction and payload a priori, per chance of another change: work alters these, repair and damage the others
+SERVICE_ODDS = 10.0
 FRICTION_SIZE, LOAD_SIZE, TORQUE_SIZE, GAIN_SIZE, ENCODER_SIZE, RIPPLE_SIZE = 0.5, 0.1, 0.3, 0.2, 0.05, 0.1
 
 
@@ -38,6 +40,11 @@ class ArmCause(NamedTuple):
     joint: str  # empty for what concerns the whole arm
     columns: tuple[int, ...]
     parameter: str  # of the first column
+
+    @property
+    def odds(self) -> float:
+        """How likely it is a priori, relative to others."""
+        return SERVICE_ODDS if self.kind in ("friction", "payload") else 1.0
 
     @property
     def name(self) -> str:
@@ -159,7 +166,10 @@ class ArmBaseline(BaselineModel):
             return None  # whoever reads other baselines says what is wrong
         if content.pop("format", None) != ARM_FORMAT:
             return None
-        if (version := content.pop("version", None)) != VERSION:
+        version = content.pop("version", None)
+        if version == 1 and isinstance(loop := content.get("loop"), dict):
+            loop["curve_speed"] = 0.0  # friction was a straight line then
+        elif version != VERSION:
             raise BaselineError(
                 f"{path}: baseline of version {version!r}, this program reads {VERSION}: learn it again"
             )
@@ -182,7 +192,7 @@ def coefficient_names(model: ArmModel) -> tuple[str, ...]:
         for what in FRICTION[:2]
     ]
     tool = [f"tool.{what}" for what in PAYLOAD] if model.loop.tool is not None else []
-    return (*model.names, *load, *warm, *tool)
+    return (*model.names, *load, *warm, *tool, *(f"{name}.lag" for name in arm.names if model.loop.curve_speed))
 
 
 def complete_columns(model: ArmModel, signals: ArmSignals, theta: FloatArray, temperature: FloatArray) -> FloatArray:
@@ -204,7 +214,13 @@ def complete_columns(model: ArmModel, signals: ArmSignals, theta: FloatArray, te
             more += [own[j][what] * (signals.temperature[:, j] - temperature[j]) for what in FRICTION[:2]]
     if model.loop.tool is not None:
         more += [signals.mass[:, index] * signals.tool for index in range(len(PAYLOAD))]
-    return np.concatenate([signals.columns, np.stack(more, axis=1)], axis=1)
+    columns = np.concatenate([signals.columns, np.stack(more, axis=1)], axis=1)
+    if not model.loop.curve_speed:
+        return columns
+    expected = np.einsum("jpm,p->jm", columns, theta[: columns.shape[1]])
+    lag = np.zeros((n, n, signals.t.size))
+    lag[range(n), range(n)] = -np.gradient(expected, signals.t, axis=1)
+    return np.concatenate([columns, lag], axis=1)
 
 
 def deviation_columns(model: ArmModel, signals: ArmSignals, design: FloatArray, theta: FloatArray) -> FloatArray:

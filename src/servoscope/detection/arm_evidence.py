@@ -29,7 +29,7 @@ class CauseEvidence(NamedTuple):
     """What a recording says of one cause."""
 
     cause: ArmCause
-    log_factor: float  # logarithm of its Bayes factor against no change, over all onsets
+    log_factor: float  # logarithm of its Bayes factor against no change, over all onsets, times its prior
     onset: FloatArray  # (K,) probability of each block to be the first that has changed
     size: FloatArray  # (k,) of its columns, over all onsets
     covariance: FloatArray  # (k, k)
@@ -68,12 +68,14 @@ class ChangeTest:
         self._damping = np.linalg.inv(np.eye(scale.size) + R * drift**2)
         R = self._damping @ R
         self._terms = [_Term.of(R, list(cause.columns), scale) for cause in causes]
+        odds = np.array([cause.odds for cause in causes])
+        self._log_prior = np.log(odds / odds.sum())
 
     def weigh(self) -> ChangeEvidence:
         """Return the evidence of the recording itself."""
         r = self._change_vector(self._information.g[None])
         found = []
-        for cause, term in zip(self._causes, self._terms, strict=True):
+        for cause, term, log_prior in zip(self._causes, self._terms, self._log_prior, strict=True):
             sizes = term.sizes(r)[0]
             logs = term.log_factors(r)[0]
             total = float(np.logaddexp.reduce(logs))
@@ -81,13 +83,14 @@ class ChangeTest:
             size = onset @ sizes
             off = sizes - size
             covariance = np.einsum("k,kij->ij", onset, term.covariance) + np.einsum("k,ki,kj->ij", onset, off, off)
-            found.append(CauseEvidence(cause, total - float(np.log(logs.size)), onset, size, covariance))
+            log_factor = total - float(np.log(logs.size)) + float(log_prior)
+            found.append(CauseEvidence(cause, log_factor, onset, size, covariance))
         logs = np.array([evidence.log_factor for evidence in found])
         order = np.argsort(-logs)
         total = float(np.logaddexp.reduce(logs))
         probability = np.exp(logs[order] - total)
         t = self._information.t[:-1]
-        return ChangeEvidence(t, total - float(np.log(logs.size)), tuple(found[i] for i in order), probability)
+        return ChangeEvidence(t, total, tuple(found[i] for i in order), probability)
 
     def healthy_limit(self, share: float) -> float:
         """Return what the logarithm of the Bayes factor of any change exceeds in a share of healthy recordings.
@@ -107,7 +110,7 @@ class ChangeTest:
         r = self._change_vector(g + np.einsum("kij,skj->ski", A, effect))
         factors = (term.log_factors(r) for term in self._terms)
         logs = np.array([np.logaddexp.reduce(factor, axis=1) - np.log(factor.shape[1]) for factor in factors])
-        total = np.logaddexp.reduce(logs, axis=0) - np.log(len(logs))
+        total = np.logaddexp.reduce(logs + self._log_prior[:, None], axis=0)
         return float(np.quantile(total, 1.0 - share))
 
     def _change_vector(self, g: FloatArray) -> FloatArray:

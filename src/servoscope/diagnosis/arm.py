@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servoscope.baseline.arm import UNKNOWN, ArmBaseline, ArmCause
+from servoscope.baseline.arm import SERVICE_ODDS, UNKNOWN, ArmBaseline, ArmCause
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.messages import Message, message
@@ -168,9 +168,11 @@ def _smallest_changes(
     first, scale = len(baseline.theta), np.array(baseline.scale)
     A = information.A.sum(0)
     known = A - A @ np.linalg.solve(A + prior, A)
-    # of one column alone: c^2 R / 2 has to exceed the limit and what the choice among causes costs
-    needed = 2.0 * (baseline.limit + np.log(len(baseline.causes)))
-    smallest = np.sqrt(needed * (1.0 / np.maximum(np.diag(known)[first:], 1e-300) + np.array(baseline.drift) ** 2))
+    variance = 1.0 / np.maximum(np.diag(known)[first:], 1e-300) + np.array(baseline.drift) ** 2
+    # of one column alone: c^2 / 2 over its variance has to exceed the limit and what the choice among causes, onsets
+    # and sizes costs
+    choice = sum(cause.odds for cause in baseline.causes) / SERVICE_ODDS * len(information.A)
+    smallest = np.sqrt(2.0 * (baseline.limit + np.log(choice * np.sqrt(1.0 + scale**2 / variance))) * variance)
     messages = [message("arm.smallest_mass", mass=float(smallest[0]))] if smallest[0] < scale[0] else []
     for joint, moves in zip(baseline.model.arm.names, moved, strict=True):
         cause = next(cause for cause in baseline.causes if cause.joint == joint)
@@ -186,7 +188,7 @@ def _explain(
     """Return verdict, headline, interval and reasons of a change."""
     named = [index for index, cause in enumerate(evidence.causes) if cause.cause.kind != UNKNOWN]
     explained = evidence.causes[named[0]].log_factor / max(evidence.log_factor, 1e-9)
-    remains = named[0] > 0 and explained >= MIN_EXPLAINED
+    remains = explained >= MIN_EXPLAINED and evidence.probability[named].sum() < 1.0 - MIN_RIVAL_PROBABILITY
     if remains:  # one cause explains most: what remains is told, and hides no name
         causes = tuple(evidence.causes[index] for index in named)
         logs = np.array([cause.log_factor for cause in causes])

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import LoopError
-from servoscope.core.settings import Finite, NonEmptyStr, Positive, Settings, parse_toml, read_toml_text
+from servoscope.core.settings import Finite, NonEmptyStr, NonNegative, Positive, Settings, parse_toml, read_toml_text
 from servoscope.core.settings_errors import describe_error
 from servoscope.models.arm.dynamics import STANDARD_GRAVITY
 from servoscope.models.arm.urdf import Kinematics, parse_urdf
@@ -53,6 +53,9 @@ class ArmLoop(Settings):
     cutoff: Positive = DEFAULT_CUTOFF  # of the filters on motion and torque [Hz]
     rest_speed: Positive = 0.03  # speed below which a joint rests, and its friction is not known [rad/s or m/s]
     sign_speed: Positive = 0.01  # v0 of tanh(v/v0), which stands for the sign in Coulomb friction [rad/s or m/s]
+    # v1 of tanh(v/v1), by which friction departs from a straight line over the speed [rad/s or m/s]; 0: it does not,
+    # and torques do not lag behind positions, as in models that are published
+    curve_speed: NonNegative = 0.5
     load_friction: bool = True  # whether Coulomb friction grows with the load on a joint
     # where drive gains come from: data sheets, or a known load, without which masses are relative to the gains
     gains: Literal["data sheet", "load"] = "data sheet"
