@@ -27,6 +27,7 @@ KIND_TOLERANCE = 0.05  # relative excess by which recordings of one kind of moti
 MIN_WINDOW_SHARE = 0.5  # of a window, from which what it holds of the recording's beginning counts
 MIN_MOTION_SHARE = 1e-3  # of the largest value of a quantity: below, r or y counts as still
 MIN_DIRECTION_SHARE = 1e-6  # of the mean square of a regressor: directions without motion say nothing
+AT_ONCE = 8192  # evaluations that are compared together
 SIGNALS = 2  # r and y
 MOMENTS = 3  # mean squares of position, speed and acceleration
 
@@ -107,7 +108,9 @@ class RecordedMotion:
 
     def excess(self, seen: MotionRange, at: slice) -> FloatArray:
         """Return `motion_excess` at evaluations, shape (K, 4)."""
-        return motion_excess(self.pipeline, seen, *self.quantities(at))
+        chunks = outofcore.iter_chunks(*at.indices(len(self.sums) - 1)[:2], self.sums, at_once=AT_ONCE)
+        parts = [motion_excess(self.pipeline, seen, *self.quantities(rows)) for rows in chunks]
+        return np.concatenate(parts) if parts else np.empty((0, len(QUANTITIES)))
 
     def model_error(self, seen: MotionRange, tuning: Tuning, at: slice) -> FloatArray:
         """Return `model_error_covariance` at evaluations, shape (K, n, n)."""

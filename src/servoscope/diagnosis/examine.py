@@ -97,7 +97,7 @@ class Examination:
             baseline = baseline.model_copy(update=followed)
         exam = _run_quickly(baseline, recording) if quick and along is None else None
         exam = exam or _run_recursion(baseline, recording, pipeline, along)
-        skipped = _skipped_share(exam.estimates)
+        skipped = exam.estimates.skipped_share
         replaced = _has_failed_instrument(exam)
         if replaced or skipped > MAX_SKIPPED_SHARE:
             other = loop.model_copy(update={"monitor": loop.monitor.model_copy(update=FALL_BACK)})
@@ -126,9 +126,8 @@ class Examination:
     def release(self) -> None:
         """Free the memory of a recording and of estimates that lie in files; they are read again where needed."""
         moved = () if self.motion is None else (self.motion.sums, self.motion.updates)
-        outofcore.release(
-            *self.recording.columns, *vars(self.estimates).values(), self.statistic, self.expected, *moved
-        )
+        estimated = (*vars(self.estimates).values(), self.statistic, self.expected)
+        outofcore.release(*self.recording.columns, *estimated, *moved)
 
     @property
     def evaluations(self) -> int:
@@ -214,11 +213,7 @@ class Examination:
         seen = self.baseline.limited_motion
         if self.motion is None or seen is None:
             return np.zeros(len(self.statistic[at]))
-        first, end, _ = at.indices(self.evaluations)
-        excess = np.zeros(max(end - first, 0))
-        for rows in outofcore.iter_chunks(first, end, self.motion.sums, at_once=AT_ONCE):
-            excess[rows.start - first : rows.stop - first] = np.abs(self.motion.excess(seen, rows)).max(axis=1)
-        return excess
+        return np.asarray(np.abs(self.motion.excess(seen, at)).max(axis=1))
 
     def model_error(self, at: slice) -> FloatArray:
         """Return what a motion never seen adds to the covariance at some evaluations, shape (K, n, n)."""
@@ -403,10 +398,3 @@ def _has_failed_instrument(exam: Examination) -> bool:
     if not own.any():
         return False
     return bool(np.linalg.eigvals(np.linalg.lstsq(own, shared, rcond=None)[0]).real.min() < MIN_INSTRUMENT_EIGENVALUE)
-
-
-def _skipped_share(estimates: Estimates) -> float:
-    if not len(estimates.updates):
-        return 0.0
-    skipped, updated = float(estimates.skipped[-1]), float(estimates.updates[-1])
-    return skipped / max(skipped + updated, 1.0)
