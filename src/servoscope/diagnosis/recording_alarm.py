@@ -23,10 +23,9 @@ class RecordingAlarm:
 
 def first_alarm(exam: Examination, progress: Callable[[str], None] = lambda _: None) -> RecordingAlarm | None:
     """Return the first alarm of an examination; None if there was none."""
-    alarms = np.flatnonzero(exam.alarm)
-    if not alarms.size:
+    if not exam.alarm.any():
         return None
-    first = int(alarms[0])
+    first = int(exam.alarm.argmax())
     # the sequential test alarms at any sample, T^2 at its evaluations
     crossed = int(exam.estimates.crossed[first]) - 1
     at_once = crossed >= 0 and not exam.baseline.loop.monitor.on_delay
