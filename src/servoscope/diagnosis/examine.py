@@ -375,9 +375,7 @@ def _noise_growth(pipeline: Pipeline, estimates: Estimates) -> float:
     quantile over time tells it from a fault, whose residual is large only until the estimate has followed.
     """
     settled = estimates.power[estimates.updates > 3.0 * pipeline.memory]
-    if not len(settled):
-        return 1.0
-    growth = float(np.quantile(settled, 0.1))
+    growth = float(np.quantile(settled, 0.1)) if len(settled) else 1.0
     return growth if growth > MIN_NOISE_GROWTH else 1.0
 
 
