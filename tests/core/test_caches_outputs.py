@@ -14,7 +14,7 @@ from commands import one_line, run
 
 from servoscope.core.cache_folders import warn_of_missing_cache
 from servoscope.core.files import atomic_write, exclusive_folder
-from servoscope.core.jit import kernel
+from servoscope.core.jit.loops import kernel
 
 NOWHERE = "/proc/nowhere"  # not even the administrator can make it
 NO_CACHES = {
@@ -29,7 +29,7 @@ BOTH_LIBRARIES = """
 from servoscope.core.cache_folders import replace_library_warnings
 replace_library_warnings()
 import matplotlib.figure
-from servoscope.core.jit import kernel
+from servoscope.core.jit.loops import kernel
 kernel(lambda x: x)
 """
 

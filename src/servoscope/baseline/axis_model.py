@@ -12,7 +12,7 @@ from servoscope.baseline.covariates import CovariateModel
 from servoscope.core.arrays import FloatArray
 from servoscope.estimation.axis_filter import NO_LAG, AxisNoise, DriveLag
 from servoscope.models.plants import Fault
-from servoscope.models.plants.axis import BY_DIRECTION, AxisPlant
+from servoscope.models.plants.axis import BY_DIRECTION, FRICTION, FRICTION_FAULT, AxisPlant
 
 
 class AxisMoves(BaseModel):
@@ -69,8 +69,11 @@ class AxisModel(BaseModel):
         return self.model_copy(update={"covariance": tuple(map(tuple, C.tolist()))})
 
     def visible_faults(self, faults: Sequence[Fault]) -> tuple[Fault, ...]:
-        """Return those faults that multiply something that the healthy recordings show."""
+        """Return those faults that multiply something that the healthy recordings show; all friction: all of it."""
         both = {"viscous_friction": BY_DIRECTION} if "viscous_friction" not in self.coefficients else {}
+        faults = [
+            f for f in faults if f.name != FRICTION_FAULT[0] or not set(FRICTION + BY_DIRECTION) & set(self.unseen)
+        ]
         return tuple(
             fault for fault in faults if not set(both.get(fault.parameter, (fault.parameter,))) <= set(self.unseen)
         )

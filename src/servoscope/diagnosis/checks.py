@@ -27,7 +27,7 @@ def suspects(interval: FaultInterval) -> tuple[str, ...]:
 
 def checks_of_fault(loop: Loop, name: str) -> Iterator[Message]:
     """Yield what to check for one fault; nothing where nobody has said it."""
-    checks = next((fault.checks for fault in loop.plant.faults if fault.name == name), "")
+    checks = next((fault.checks for fault in loop.plant.all_faults if fault.name == name), "")
     if name in (loop.checks or {}):
         yield from map(text_message, (loop.checks or {})[name])
     elif checks:

@@ -200,15 +200,15 @@ def _with_warnings(diagnosis: Diagnosis, more: Sequence[DiagnosisWarning]) -> Di
 
 
 def _first_alarm_time(exam: Examination) -> float:
-    alarms = np.flatnonzero(exam.apparent_alarm)
-    changed = exam.features_changed_s
-    return min(float(exam.t(alarms[0])) if alarms.size else np.inf, np.inf if changed is None else changed)
+    alarm, changed = exam.apparent_alarm, exam.features_changed_s
+    first = float(exam.t(int(alarm.argmax()))) if alarm.any() else np.inf
+    return min(first, np.inf if changed is None else changed)
 
 
 def largest_statistic_ratio(exam: Examination) -> float:
     """Return the largest value of all statistics, as a multiple of its limit."""
-    ratios = [statistic.value / statistic.limit for statistic in exam.statistics]
-    return float(np.maximum.reduce(ratios)[exam.ready].max(initial=0.0))
+    ratios = (statistic.value / statistic.limit for statistic in exam.statistics)
+    return max(float(ratio.max(where=exam.ready, initial=0.0)) for ratio in ratios)
 
 
 def _change_size(diagnosis: Diagnosis) -> float:
@@ -288,12 +288,13 @@ def _explain_alarm(
         return (ml_refit.vibration_interval(exam, exam.change.vibration),), alarm.onset, []
     onset, refit, doubts = alarm.onset, None, list[DiagnosisWarning]()
     recursive = candidates = isolate(*isolation_inputs(exam, onset, alarm.evaluation), lambda: progress("isolation"))
+    exam.release()
     progress("refit")
     last = int(exam.estimates.index[alarm.evaluation])
     # the refit takes the model for exact, but that of an axis follows the recording
     seen = exam.change is not None or (
         not exam.drifts
-        and (exam.motion_excess(slice(int(np.flatnonzero(exam.alarm)[0]), alarm.evaluation + 1)) < UNSEEN_EXCESS).all()
+        and (exam.motion_excess(slice(int(exam.alarm.argmax()), alarm.evaluation + 1)) < UNSEEN_EXCESS).all()
     )
     refined = ml_refit.refit_recording(exam, onset, alarm.sample, last, lambda: progress("refit")) if seen else None
     if refined is not None and not _prefers_learned_fault(refined, recursive[0]):
@@ -350,10 +351,9 @@ class RecordingAlarm:
 
 def first_alarm(exam: Examination, progress: Callable[[str], None] = lambda _: None) -> RecordingAlarm | None:
     """Return the first alarm of an examination; None if there was none."""
-    alarms = np.flatnonzero(exam.alarm)
-    if not alarms.size:
+    if not exam.alarm.any():
         return None
-    first = int(alarms[0])
+    first = int(exam.alarm.argmax())
     # the sequential test alarms at any sample, T^2 at its evaluations
     crossed = int(exam.estimates.crossed[first]) - 1
     at_once = crossed >= 0 and not exam.baseline.loop.monitor.on_delay

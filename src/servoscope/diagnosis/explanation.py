@@ -13,6 +13,7 @@ from servoscope.core.number_format import ratio_digits
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.change_words import change_messages, fault_label
 from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.ml_refit import is_equal_pair
 from servoscope.diagnosis.result import VIBRATION, DiagnosisWarning, FaultInterval, RefitSummary, Verdict
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
@@ -179,6 +180,7 @@ def build_reasons(exam: Examination, trace: Trace, interval: FaultInterval) -> t
         _fit_reason(interval.candidates, interval.refit),
         _rejection_reason(exam, trace, interval.candidates),
         _second_fault_reason(interval.candidates),
+        _equal_pairs_reason(exam.baseline.plant, interval.candidates),
         _mimics_reason(interval.candidates, interval.refit),
     )
     return tuple(reason for reason in reasons if reason is not None)
@@ -201,8 +203,9 @@ def _alarm_reason(exam: Examination, interval: FaultInterval) -> Message | None:
     if exam.estimates.level[first] >= 1.0:
         return message("diagnosis.alarm_cusum", t=interval.detected_at_s)
     value, limit = float(exam.statistic[first]), exam.baseline.thresholds.statistic
-    if value <= limit and exam.change is not None:
-        return message("diagnosis.alarm_change", t=interval.detected_at_s)
+    if value <= limit:  # then the other tests alone may have raised it
+        kind = "cusum" if exam.change is None else "change"
+        return message(f"diagnosis.alarm_{kind}", t=interval.detected_at_s)
     return message("diagnosis.alarm_t2", t=interval.detected_at_s, value=value, limit=limit)
 
 
@@ -325,6 +328,21 @@ def _second_fault_reason(candidates: Sequence[Candidate]) -> Message | None:
         return None
     others = sorted({name for pair in pairs for name in pair.names} - set(best.names))
     return message("diagnosis.second_fault", names=_labels(others))
+
+
+def _equal_pairs_reason(plant: Plant, candidates: Sequence[Candidate]) -> Message | None:
+    """Name the pairs that do the same to u and y as the fault, which takes one parameter less."""
+    pairs = tuple(
+        message(
+            "diagnosis.equal_pair",
+            sizes=tuple(
+                message("diagnosis.rejected_size_parameter", parameter=f.parameter, ratio=f.ratio) for f in c.faults
+            ),
+        )
+        for c in candidates[1:]
+        if is_equal_pair(plant, candidates[0], c)
+    )
+    return message("diagnosis.equal_pairs", pairs=pairs) if pairs else None
 
 
 def _mimics_reason(candidates: Sequence[Candidate], refit: RefitSummary | None) -> Message | None:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # its kernels are loaded after an alarm, not before
     from servoscope.isolation.ml.axis_vibration import AxisVibration
 
 MIN_PAIR_PROBABILITY = 1e-3  # probability from which a pair of faults is listed
+MAX_EQUAL_MISFIT = 6.0  # squared standard deviations by which a pair may fit worse: its likelihood is a twentieth
 MAX_SIZE_DISTANCE = 3.0  # standard deviations between two sizes that are called different
 
 
@@ -62,14 +63,26 @@ def vibration_interval(exam: Examination, found: AxisVibration) -> FaultInterval
 def refit_candidates(refined: RefitResult) -> tuple[Candidate, ...]:
     """Return all single faults, the pairs worth listing and ``unknown``, the most probable first."""
     least = min(hypothesis.fitted.cost for hypothesis in refined.hypotheses)
+    plant = refined.window.plant
+    every = [_candidate(hypothesis, plant, least, refined.noise_variance) for hypothesis in refined.hypotheses]
     candidates = [
-        _candidate(hypothesis, refined.window.plant, least, refined.noise_variance)
-        for hypothesis in refined.hypotheses
-        if len(hypothesis.fitted.faults) == 1 or hypothesis.probability >= MIN_PAIR_PROBABILITY
+        candidate
+        for candidate in every
+        if len(candidate.faults) == 1
+        or candidate.probability >= MIN_PAIR_PROBABILITY
+        or is_equal_pair(plant, every[0], candidate)
     ]
     candidates.append(Candidate(name=UNKNOWN, probability=refined.unknown_probability))
     # where probabilities vanish, the closest comes first
     return tuple(sorted(candidates, key=lambda candidate: (-candidate.probability, candidate.misfit or 0.0)))
+
+
+def is_equal_pair(plant: Plant, best: Candidate, other: Candidate) -> bool:
+    """Return whether a pair of other parameters does the same to u and y as a fault that takes one parameter."""
+    if len(best.faults) != 1 or len(other.faults) < 2 or best.misfit is None or other.misfit is None:
+        return False
+    own = plant.expand_rays({fault.parameter: 1.0 for fault in best.faults})
+    return other.misfit < best.misfit + MAX_EQUAL_MISFIT and own.keys().isdisjoint(f.parameter for f in other.faults)
 
 
 def refit_onset(refined: RefitResult, exam: Examination, outside: OnsetEstimate | None = None) -> Onset:

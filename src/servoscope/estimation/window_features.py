@@ -180,7 +180,7 @@ class WindowLanes:
 
 @functools.cache
 def _compile() -> Callable[..., int]:
-    from servoscope.core.jit import kernel  # late: it imports Numba
+    from servoscope.core.jit.loops import kernel  # late: it imports Numba
 
     return kernel(_accumulate)
 

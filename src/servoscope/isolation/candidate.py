@@ -34,6 +34,11 @@ class FaultEstimate(ResultModel):
         return self.parameter == SEVERITY
 
     @property
+    def may_be_healthy(self) -> bool:
+        """Whether the 95 % interval of its ratio holds the healthy value; a share of a labelled severity never does."""
+        return not self.learned and self.interval[0] <= 1.0 <= self.interval[1]
+
+    @property
     def change(self) -> float:
         """How far from healthy it is: of the parameter's healthy value, or of the labelled severity."""
         return self.ratio if self.learned else abs(self.ratio - 1.0)

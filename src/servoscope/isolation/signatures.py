@@ -64,7 +64,8 @@ def _plant_signatures(
     if plant.has_physics and not plant.parameters_are_coefficients:
         shift = _nominal_shifts(baseline, learned)
         return [parameter_signature(f, partial(shift, f.parameter)) for f in faults]
-    directions = fault_directions(baseline.loop, plant, np.array(baseline.theta))
+    names = dict.fromkeys([*plant.parameters, *(name for ray in plant.rays for name in ray.exponents)])
+    directions = fault_directions(baseline.loop, plant, np.array(baseline.theta), [*names])
     moving = [fault for fault in plant.faults if np.any(directions[fault.parameter])]
     single = [
         coefficient_signature(fault, learned @ directions[fault.parameter])

@@ -21,13 +21,3 @@ def kernel(function: F) -> F:
     except RuntimeError:  # Numba found no folder that it can write
         warn_of_missing_cache()
         return compile_function()(function)  # type: ignore[no-any-return]
-
-
-def subroutine(function: F) -> F:
-    """Compile a part of kernels, never called from Python."""
-    return numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)  # type: ignore[no-any-return]
-
-
-def inline(function: F) -> F:
-    """Compile a part of kernels that is always inlined."""
-    return numba.njit(error_model="numpy", forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)  # type: ignore[no-any-return]

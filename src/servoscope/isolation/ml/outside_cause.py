@@ -11,7 +11,8 @@ from servoscope.core.arrays import FloatArray, IntArray
 from servoscope.isolation.ml.hypothesis import MAX_EXCESS_SQUARES, HypothesisFit, refit_jointly
 from servoscope.isolation.ml.onset import ONSET_COST_QUANTILE, POSTERIOR_SHARE, OnsetEstimate, onset_posterior
 from servoscope.isolation.ml.other_causes import CauseWindow, OtherCause, causes_at, parameter_cause
-from servoscope.isolation.ml.search import MAX_LOOKS, RefitResult
+from servoscope.isolation.ml.result import RefitResult
+from servoscope.isolation.ml.search import MAX_LOOKS
 from servoscope.isolation.ml.start_values import fit_further_parameters
 from servoscope.isolation.ml.timeline import MAX_BRIDGE, bridge_height
 from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow

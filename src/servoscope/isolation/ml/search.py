@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -23,6 +23,7 @@ from servoscope.isolation.ml.hypothesis import (
     refit_jointly,
 )
 from servoscope.isolation.ml.onset import OnsetEstimate, onset_posterior
+from servoscope.isolation.ml.result import Hypothesis, RefitResult
 from servoscope.isolation.ml.start_values import SizeGrid, choose_start, fit_further_parameters, pair_start_values
 from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow, RefitWindow
 from servoscope.models.plants import Fault
@@ -39,46 +40,9 @@ MIN_LOOK_GAIN = 1.0  # of the sum of squares that a look gained, for another one
 MAX_PAIR_MISFIT = 10.0  # of what noise leaves unexplained at most, from which a pair is not followed to its onset
 WIDE_RATIO_RANGE = (0.02, 500.0)  # of a fault whose best size lies at an end of its own range
 MAX_WIDER_SEARCHES = 3  # each with more faults of that range: one, then a pair
+MIN_SECOND_SHARE = 0.02  # of the first cause's logarithm, up to which a second one is no cause
+MIN_PAIR_GAIN = 10.8  # of the sum of squares over the noise: a second cause that is none gains it once in a thousand
 MAX_SHARP_ONSET_SAMPLES = 20  # samples of an onset's interval, up to which the step is loud
-
-
-@dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """One explanation: its fit, its evidence and its probability."""
-
-    fitted: HypothesisFit
-    evidence: HypothesisEvidence
-    probability: float
-
-    @property
-    def name(self) -> str:
-        """Names of its faults, joined by plus signs."""
-        return " + ".join(fault.name for fault in self.fitted.faults)
-
-
-@dataclass(frozen=True, eq=False)
-class RefitResult:
-    """Result of the refit."""
-
-    window: ChangeWindow  # what it looked at
-    hypotheses: tuple[Hypothesis, ...]  # most probable first
-    other_parameters: tuple[HypothesisFit, ...]  # outside the list of faults, each as if it alone had changed
-    unknown_probability: float  # probability that it is none of the hypotheses
-    goodness: GoodnessOfFit  # of the most probable one
-    onset: OnsetEstimate  # onset, in samples of the window
-    noise_variance: float  # variance of the innovations under it, 1 for the baseline's noise
-    initial_onset: int  # sample of the window from which the search for the onset started
-    latest: int  # and up to which it went
-
-    @property
-    def is_unknown(self) -> bool:
-        """Whether none of the hypotheses is the most probable answer."""
-        return self.unknown_probability > self.best.probability
-
-    @property
-    def best(self) -> Hypothesis:
-        """The most probable hypothesis."""
-        return self.hypotheses[0]
 
 
 def onset_window(baseline: Baseline, recording: Recording, onset: int, last: int) -> ChangeWindow:
@@ -123,7 +87,7 @@ def _search(
 ) -> RefitResult:
     """Search, with wider ranges while the best size lies at the end of one: a pair stands in for a severe fault there.
 
-    What lies at the end of the widest range has no name.
+    What lies at the end of the widest range has no name, nor has what may be healthy.
     """
     for _ in range(MAX_WIDER_SEARCHES):
         result = _HypothesisSearch(window, faults, onset, announced, progress).run()
@@ -131,8 +95,8 @@ def _search(
         if not ends:
             break
         faults = [replace(fault, ratio_range=WIDE_RATIO_RANGE) if fault in ends else fault for fault in faults]
-    named = [replace(h, probability=0.0) if h.fitted.faults_at_ends else h for h in result.hypotheses]
-    unknown = result.unknown_probability + sum(h.probability for h in result.hypotheses if h.fitted.faults_at_ends)
+    named = [h if h.has_name else replace(h, probability=0.0) for h in result.hypotheses]
+    unknown = result.unknown_probability + sum(h.probability for h in result.hypotheses if not h.has_name)
     named.sort(key=lambda hypothesis: -hypothesis.probability)  # stable: where all vanish, the likeliest stays first
     return replace(result, hypotheses=tuple(named), unknown_probability=unknown)
 
@@ -328,7 +292,7 @@ class _HypothesisSearch:
     def _weigh(self, fitted: Sequence[HypothesisFit], found: OnsetEstimate) -> RefitResult:
         window, n = self.window, len(self.faults)
         scales = {fault: SizePrior.from_window(window, fault, found.profile) for fault in self.faults}
-        own = n - len(self.rays)
+        own = sum(fault.name not in self.rays for fault in self.faults)
         several = PAIR_PRIOR if own > 1 else 0.0
         prior = {1: (1.0 - several - OUTSIDE_PRIOR) / n, 2: several / max(own * (own - 1) / 2, 1)}
         best = self._update_noise_variance(fitted)
@@ -349,6 +313,7 @@ class _HypothesisSearch:
         logs = np.array([e.log + np.log(prior[len(f.names)]) for e, f in zip(told, fitted, strict=True)])
         likeliest = int(np.argmax(logs))
         good = self._goodness(fitted[likeliest])
+        self._prefer_singles(fitted, logs)
         # unknown: what nothing explains, or what a parameter outside the list explains better
         others = fit_further_parameters(window, fitted[likeliest].profile, fitted[likeliest], self.noise_variance)
         rivals = [
@@ -356,7 +321,7 @@ class _HypothesisSearch:
             for f in others
             if f.has_free_nuisances and self._is_contender(f, best)
         ]
-        nothing = logs[likeliest] + 0.5 * (good.statistic - good.limit)
+        nothing = logs.max() + 0.5 * (good.statistic - good.limit)
         logs = np.append(logs, np.logaddexp.reduce([nothing, *rivals]))
         probability = np.exp(logs - logs.max())
         probability /= probability.sum()
@@ -376,6 +341,29 @@ class _HypothesisSearch:
             self.latest,
         )
 
+    def _prefer_singles(self, fitted: Sequence[HypothesisFit], logs: FloatArray) -> None:
+        """Let a single fault take the place of a pair that does the same, as soon as the pair might be preferred."""
+        singles = sorted((i for i, f in enumerate(fitted) if len(f.faults) == 1), key=lambda i: -logs[i])
+        likely = logs[singles[0]] + np.log(PAIR_PRIOR)
+        for i, pair in enumerate(fitted):
+            if len(pair.faults) > 1 and logs[i] > likely:
+                alone = next((k for k in singles if self._is_alike(fitted[k], pair)), None)
+                if alone is not None:
+                    logs[alone], logs[i] = np.logaddexp(logs[alone], logs[i]), -np.inf
+
+    def _is_alike(self, single: HypothesisFit, pair: HypothesisFit) -> bool:
+        """Return whether a single fault differs from a pair by no more than noise, or than the model is trusted to."""
+        gain = single.cost - pair.cost - MIN_PAIR_GAIN * self.noise_variance
+        if gain <= 0.0:
+            return True
+        moved = self.window.plant.expand_rays({single.names[0]: np.e})
+        direction = np.log([moved.get(name, 1.0) for name in pair.names])
+        if not direction.any():  # other parameters: what both do to the innovations
+            return gain <= self._model_error(single) ** 2
+        size = direction @ pair.x / (direction @ direction)
+        trusted = max(MIN_SECOND_SHARE * abs(size), self.window.size_error)
+        return bool(np.abs(pair.x - size * direction).max() <= trusted)
+
     def _evidence(self, fitted: HypothesisFit, scales: Mapping[Fault, SizePrior]) -> HypothesisEvidence:
         each = [
             scales.get(fault) or SizePrior.from_window(self.window, fault, fitted.profile) for fault in fitted.faults
@@ -387,10 +375,15 @@ class _HypothesisSearch:
         predictor = window.predictor(fitted.d, fitted.names, fitted.x, profile)
         healthy = window.predictor(fitted.d, (), np.zeros(0), profile)
         where = np.arange(window.samples) >= profile.onset
-        e = fitted.residual[: window.samples]
-        shift = window.systematic * float(np.linalg.norm(window.innovations(healthy, profile) - e))
         Z, J = misspecification_columns(window, predictor, profile, where), fitted.jacobian
         if window.coloured:  # what the terms left out before the change is no sign of another one
             always = misspecification_columns(window, healthy, profile, np.ones_like(where))
             J = np.hstack([J, np.vstack([always, np.zeros((len(J) - len(always), always.shape[1]))])])
+        shift = self._model_error(fitted)
         return score_test(Z, J, fitted.residual, self.noise_variance, shift, window.coloured)
+
+    def _model_error(self, fitted: HypothesisFit) -> float:
+        """Return what the model may be off by: a share of what the change does to the innovations, as their norm."""
+        window, profile = self.window, fitted.profile
+        e = window.innovations(window.predictor(fitted.d, (), np.zeros(0), profile), profile)
+        return window.systematic * float(np.linalg.norm(e - fitted.residual[: window.samples]))

@@ -13,7 +13,8 @@ from servoscope.fit.predictor import Predictor
 from servoscope.isolation.ml.hypothesis import HypothesisFit, fit_hypothesis
 from servoscope.isolation.ml.onset import onset_posterior
 from servoscope.isolation.ml.plant_sequence import SequenceCost, likeliest_sequence
-from servoscope.isolation.ml.search import RefitResult, fit_stretch
+from servoscope.isolation.ml.result import RefitResult
+from servoscope.isolation.ml.search import fit_stretch
 from servoscope.isolation.ml.start_values import SizeGrid
 from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
 from servoscope.models.plants import Fault

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from servoscope.core.arrays import FloatArray
-from servoscope.models.plants.base import Fault, read_translations
+from servoscope.models.plants.base import Fault, FaultRay, read_translations
 from servoscope.models.plants.columns import COLUMN_FORMS, Column
 from servoscope.models.plants.terms import TERM_TUPLE, UNIQUE_TERMS, TermColumn, TermPlant
 
@@ -87,6 +87,13 @@ FAULTS = {
         "motor and amplifier: temperature, phases, current limit; force or torque constant after an exchange",
     ),
 }
+# all that rubs: Viscous and Coulomb friction doubled together are half the inertia with twice the input gain
+FRICTION = "viscous_friction", "coulomb_friction", "stribeck_friction", "load_friction"
+FRICTION_FAULT = (
+    "friction",
+    "more friction of every kind: worn bearings, a tight guide, an old lubricant",
+    "bearings and guides: wear, preload, alignment; lubricant: amount, age, temperature",
+)
 BY_DIRECTION = "viscous_friction_forward", "viscous_friction_backward"
 
 # where a payload has weight and a known place
@@ -211,6 +218,16 @@ class AxisPlant(TermPlant):
             for parameter, (name, words, checks) in told.items()
             if parameter in known
         )
+
+    @property
+    def rays(self) -> tuple[FaultRay, ...]:
+        """All terms of friction together where there are several, then what the loop file defines."""
+        rubbing = [name for name in FRICTION if self.exponents(name)]
+        name, words, checks = FRICTION_FAULT
+        if len(rubbing) < 2 or any(ray.name == name for ray in self._rays):
+            return self._rays
+        known = self._fault(name, name, words, checks)
+        return (FaultRay(name, tuple((parameter, 2.0) for parameter in rubbing), known), *self._rays)
 
     @property
     def _lifts(self) -> bool:

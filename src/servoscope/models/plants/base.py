@@ -70,6 +70,7 @@ class FaultRay:
 
     name: str
     full: tuple[tuple[str, float], ...]  # parameters and their ratios at full size, none of them 1
+    known: Fault | None = None  # of a ray that the plant has by itself: range, words and checks
 
     @property
     def exponents(self) -> dict[str, float]:
@@ -80,6 +81,8 @@ class FaultRay:
     @property
     def fault(self) -> Fault:
         """The ray as a fault, whose parameter has the name of the ray."""
+        if self.known is not None:
+            return self.known
         ends = sorted((1.0, self.full[0][1] ** MAX_RAY_SIZE))
         words = " with ".join(f"{name} x {ratio:g}" for name, ratio in self.full)
         return Fault(self.name, self.name, (ends[0], ends[1]), f"{words} at full size")
@@ -189,7 +192,7 @@ class Plant(BaseModel, abc.ABC):
 
     @property
     def rays(self) -> tuple[FaultRay, ...]:
-        """The faults that the loop file defines as directions of several parameters."""
+        """The faults that are directions of several parameters: those that the loop file defines."""
         return self._rays
 
     def with_rays(self, rays: tuple[FaultRay, ...]) -> Self:

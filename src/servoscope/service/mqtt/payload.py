@@ -23,8 +23,8 @@ import json
 import math
 import struct
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -39,17 +39,8 @@ HEADER = struct.Struct("<4sBBHII")
 BODY_HEADER = struct.Struct("<QQQdd")
 FLAG_RETAINED, FLAG_TIMES, FLAG_BINARY32 = 1, 2, 4
 COUNTS = ("stream", "sequence", "oldest")
-PIECE_BYTES = 2**19  # of messages that are taken together: so many stay in the processor's cache
 JSON_KEYS = {"version", "stream", "sequence", "oldest", "t", "t0", "dt", "r", "u", "y", "covariates"}
-
-
-class BlockMessage(NamedTuple):
-    """A message of an asset, and when it came, by the monotonic clock [s]; `covariates`: as in `decode_block`."""
-
-    asset: str
-    content: bytes
-    received_at: float = 0.0
-    covariates: Sequence[str] = ()
+REGULAR_KEYS = JSON_KEYS - {"covariates"}
 
 
 def encode_binary(block: Block, oldest: int | None = None) -> bytes:
@@ -80,29 +71,6 @@ def _plain_column(values: FloatArray) -> list[float | None]:
     return [x if math.isfinite(x) else None for x in values.tolist()]
 
 
-def decode_blocks(messages: Sequence[BlockMessage]) -> Iterator[Block | MessageError]:
-    """Yield the block of each message, or why it is none: what `decode_block` returns or raises, in less time."""
-    from servoscope.service.mqtt.block_kernels import parse_regular  # late: it imports Numba
-
-    begin, size = 0, 0
-    for end, last in enumerate(messages, 1):
-        size += len(last.content)
-        if size < PIECE_BYTES and end < len(messages):
-            continue
-        piece, begin, size = messages[begin:end], end, 0
-        texts = [b"" if message.content[:4] == MAGIC else message.content for message in piece]
-        for message, block in zip(piece, parse_regular(texts), strict=True):
-            if block is None or message.covariates:
-                try:
-                    yield decode_block(*message)
-                except MessageError as error:
-                    yield error
-                continue
-            yield Block.from_signals(
-                message.asset, block.sequence, block.signals, message.received_at, block.stream, block.oldest
-            )
-
-
 def decode_block(asset: str, message: bytes, received_at: float = 0.0, covariates: Sequence[str] = ()) -> Block:
     """Return the block of a message, binary or JSON, that came at `received_at` by the monotonic clock [s].
 
@@ -112,7 +80,8 @@ def decode_block(asset: str, message: bytes, received_at: float = 0.0, covariate
     if message[:4] == MAGIC:
         return _decode_binary(asset, message, received_at, covariates)
     if message[:1] in (b"{", b" ", b"\n", b"\r", b"\t"):
-        return _decode_json(asset, message, received_at, covariates)
+        block = None if covariates else _decode_regular(asset, message, received_at)
+        return _decode_json(asset, message, received_at, covariates) if block is None else block
     raise MessageError("not a block", f"begins with {message[:8]!r}: neither a binary block nor a JSON object")
 
 
@@ -142,6 +111,34 @@ def _decode_binary(asset: str, message: bytes, received_at: float, covariates: S
         raise MessageError("covariates", f"{further} covariates, expected {', '.join(covariates)}")
     signals = _join_columns(t, numbers[: 3 + len(covariates)])
     return _build_block(asset, stream, sequence, oldest if flags & FLAG_RETAINED else None, signals, received_at)
+
+
+def _decode_regular(asset: str, message: bytes, received_at: float) -> Block | None:
+    """Return what `_decode_json` returns, in a third of its time; None: not regular, which it knows more of.
+
+    A message is regular if it has no covariates, each key once, and numbers alone in its lists.
+    """
+    import simdjson
+
+    try:
+        plain: Any = simdjson.Parser().parse(message)
+        whole = plain["version"], plain.get("stream", 0), plain["sequence"], plain.get("oldest", 0)
+        columns = [plain[name] for name in ("truy" if "t" in plain else "ruy")]
+        buffers = [column.as_buffer(of_type="d") for column in columns]
+        signals = np.frombuffer(bytearray().join(buffers)).reshape(len(columns), -1)
+    except (AttributeError, KeyError, TypeError, ValueError, RuntimeError):
+        return None
+    keys, (version, stream, sequence, oldest) = set(plain), whole
+    # a buffer makes one list of lists in lists; of a key that stands twice the last counts, not the first
+    are_flat = message.count(b"[") == len(columns) and {*map(len, columns)} == {signals.shape[1]}
+    if not (are_flat and len(keys) == len(plain) and keys <= REGULAR_KEYS):
+        return None
+    if version != VERSION or {*map(type, whole)} != {int}:
+        return None
+    if len(columns) == 3:
+        t = _uniform_times(_parse_number(plain, "t0"), _parse_number(plain, "dt"), signals.shape[1])
+        signals = np.concatenate([t[None], signals])
+    return _build_block(asset, stream, sequence, oldest if "oldest" in keys else None, signals, received_at)
 
 
 def _decode_json(asset: str, message: bytes, received_at: float, covariates: Sequence[str]) -> Block:
@@ -237,7 +234,7 @@ def _build_block(
     if min(counts) < 0 or max(counts) > MAX_COUNT:
         name = next(name for name, n in zip(COUNTS, counts, strict=True) if not 0 <= n <= MAX_COUNT)
         raise MessageError("out of range", f"{name}: must lie between 0 and 2^63 - 1")
-    if not (t.min() >= 0.0 and t.max() < MAX_TIME_S):  # NaN is neither
+    if not (np.minimum.reduce(t) >= 0.0 and np.maximum.reduce(t) < MAX_TIME_S):  # NaN is neither
         raise MessageError("times", "a time stamp is missing, or outside of the years 1970 to 9999")
     return Block.from_signals(asset, sequence, signals, received_at, stream, oldest)
 
@@ -247,7 +244,6 @@ class BlockMessages(Decoder):
 
     def __init__(self, prefix: str, assets: Mapping[str, SourceAsset]) -> None:
         self._prefix, self._covariates = prefix, {name: asset.covariates for name, asset in assets.items()}
-        list(decode_blocks([BlockMessage("", b"")]))  # compiles it, so that the first block does not wait for it
 
     def addresses(self, *, everyone: bool = False) -> list[str]:
         """Return the topics of these assets: another service at this broker may follow others."""
@@ -259,21 +255,8 @@ class BlockMessages(Decoder):
         return asset if asset in self._covariates else ""
 
     def decode(self, message: InboxMessage) -> Content:
-        """Return the block of one message; `decode_all` takes less time for each of many."""
+        """Return the block of one message."""
         asset = parse_asset(message.address)
         if asset not in self._covariates:
             raise MessageError("unknown asset", f"{asset[:100]!r} is none of the assets of this source")
         return Content(blocks=(decode_block(asset, message.content, message.at, self._covariates[asset]),))
-
-    def decode_all(self, messages: Sequence[InboxMessage]) -> Iterator[Content | MessageError]:
-        """Yield the block of each message, or why it is none."""
-        assets = [parse_asset(message.address) for message in messages]
-        if not self._covariates.keys() >= set(assets):
-            yield from super().decode_all(messages)
-            return
-        named = zip(assets, messages, strict=True)
-        blocks = decode_blocks(
-            [BlockMessage(k, message.content, message.at, self._covariates[k]) for k, message in named]
-        )
-        for block in blocks:
-            yield block if isinstance(block, MessageError) else Content(blocks=(block,))

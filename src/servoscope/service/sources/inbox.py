@@ -168,8 +168,8 @@ class Inbox:
 
     def _take(self, messages: Sequence[InboxMessage]) -> Iterator[bool]:
         """Take messages one by one, and block by block; yield whether to go on now."""
-        decode = self._decode_guarded if self._guard is not None else self.decoder.decode_all
-        found = decode(messages)
+        is_guarded = self._guard is not None
+        found = self._decode_guarded(messages) if is_guarded else map(self.decoder.try_decode, messages)
         for message in messages:
             yield True
             while (content := next(found)) is None:

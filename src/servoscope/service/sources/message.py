@@ -6,7 +6,7 @@ import math
 import threading
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -134,10 +134,6 @@ class Decoder(ABC):
             return error
         except Exception as error:  # decoders of other packages raise what they like
             return MessageError("not a block", f"{type(error).__name__}: {' '.join(str(error).split())[:100]}")
-
-    def decode_all(self, messages: Sequence[InboxMessage]) -> Iterator[Content | MessageError]:
-        """Yield what `try_decode` returns of each message."""
-        return map(self.try_decode, messages)
 
     def requests(self) -> Iterable[tuple[str, bytes]]:
         """Return messages, with their addresses, that ask senders for what it lacks."""
