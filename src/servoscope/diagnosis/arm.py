@@ -242,9 +242,9 @@ def _onset(evidence: ChangeEvidence, best: CauseEvidence) -> tuple[tuple[float, 
     ends = np.searchsorted(below, [ONSET_TAIL, 1.0 - ONSET_TAIL])
     low, high = (min(int(end), below.size - 1) for end in ends)
     likely = int(best.onset.argmax())
-    # the change lies somewhere in the block before the first that has it throughout
-    first = float(evidence.t[max(0, low - 1)])
-    return (first, float(evidence.t[likely]), float(evidence.t[high])), low == 0
+    # a change within a block: either this or the next is the first that is better explained with it
+    first, last = evidence.t[max(0, low - 1)], evidence.t[min(high + 1, evidence.t.size - 1)]
+    return (float(first), float(evidence.t[likely]), float(last)), low == 0
 
 
 def _fault(baseline: ArmBaseline, found: CauseEvidence) -> FaultEstimate | None:
