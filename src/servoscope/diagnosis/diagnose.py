@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +15,7 @@ from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import RecordingError, SimulationError
 from servoscope.core.messages import Message, message
 from servoscope.detection.louder_noise import find_louder_noise
-from servoscope.detection.onset import Onset, estimate_onset
+from servoscope.detection.onset import Onset
 from servoscope.detection.signal_defects import find_signal_defect
 from servoscope.detection.trace import UNSEEN_EXCESS, Trace
 from servoscope.diagnosis import ml_refit
@@ -26,8 +25,9 @@ from servoscope.diagnosis.checks import what_to_check
 from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.explanation import build_headline, build_reasons, unwatched_changes
 from servoscope.diagnosis.motion_check import motion_warnings
-from servoscope.diagnosis.output_onset import refine_onset
 from servoscope.diagnosis.own_past import examine_by_own_past, own_past_warning
+from servoscope.diagnosis.recording_alarm import RecordingAlarm, first_alarm
+from servoscope.diagnosis.repair import is_repaired, repaired_interval
 from servoscope.diagnosis.result import (
     Diagnosis,
     DiagnosisWarning,
@@ -235,6 +235,7 @@ def diagnose_examination(
     if alarm is not None:
         at = alarm.evaluation
         intervals, onset, doubts = _explain_alarm(exam, alarm, progress)
+        verdict = "healthy" if is_repaired(exam, intervals) else verdict
         warnings = _all_warnings(exam, doubts + covariate_warnings(exam, at))
         headline = build_headline(verdict, intervals, {}, warnings, baseline.point)
     elif features is not None and changed is not None:
@@ -290,6 +291,9 @@ def _explain_alarm(
     recursive = candidates = isolate(*isolation_inputs(exam, onset, alarm.evaluation), lambda: progress("isolation"))
     exam.release()
     progress("refit")
+    if exam.change is not None and exam.change.repaired:
+        past = repaired_interval(exam, recursive, MIN_CERTAINTY, lambda: progress("refit"))
+        return (past,), onset, []
     last = int(exam.estimates.index[alarm.evaluation])
     # the refit takes the model for exact, but that of an axis follows the recording
     seen = exam.change is not None or (
@@ -338,41 +342,6 @@ def _onset_of(intervals: Sequence[FaultInterval], exam: Examination, alarm: Reco
     one = next((each for each in intervals if _covers(each, at)), intervals[-1])
     assert one.onset_s is not None
     return Onset(*one.onset_s, int(np.searchsorted(exam.recording.t, one.onset_s[1])))
-
-
-@dataclass(frozen=True)
-class RecordingAlarm:
-    """The alarm of a recording: its sample, the evaluation that is explained, and the onset by the recursion."""
-
-    sample: int
-    evaluation: int
-    onset: Onset
-
-
-def first_alarm(exam: Examination, progress: Callable[[str], None] = lambda _: None) -> RecordingAlarm | None:
-    """Return the first alarm of an examination; None if there was none."""
-    if not exam.alarm.any():
-        return None
-    first = int(exam.alarm.argmax())
-    # the sequential test alarms at any sample, T^2 at its evaluations
-    crossed = int(exam.estimates.crossed[first]) - 1
-    at_once = crossed >= 0 and not exam.baseline.loop.monitor.on_delay
-    sample = crossed if at_once else int(exam.estimates.index[first])
-    # the last evaluation has forgotten most of the healthy past; where the alarm has gone, the strongest one
-    at = exam.evaluations - 1 if exam.alarm[-1] else first + int(np.argmax(exam.statistic[first:]))
-    progress("onset")
-    if (change := exam.change) is not None:
-        low, likely, high = (float(exam.recording.t[k]) for k in change.onset_interval)
-        return RecordingAlarm(change.detected, at, Onset(low, likely, high, change.onset))
-    onset = estimate_onset(
-        exam.pipeline,
-        exam.recording,
-        exam.expected[at],
-        exam.estimates.theta[at],
-        sample,
-        max(int(exam.estimates.index[at]), sample),
-    )
-    return RecordingAlarm(sample, at, refine_onset(exam, onset, sample, int(exam.estimates.index[at])))
 
 
 def _prefers_learned_fault(refined: RefitResult, recursive: Candidate) -> bool:

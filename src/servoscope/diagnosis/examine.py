@@ -181,10 +181,11 @@ class Examination:
 
     @property
     def _changed(self) -> npt.NDArray[np.bool_]:
-        """Whether a change within the recording had been detected, shape (K,)."""
-        found = self.estimates.index >= (self.recording.samples if self.change is None else self.change.detected)
-        found[-1:] |= self.change is not None  # it may be detected after the last evaluation
-        return np.asarray(found)
+        """Whether a change within the recording had been detected, or was not yet repaired, shape (K,)."""
+        change, index = self.change, self.estimates.index
+        if change is None or change.repaired:
+            return np.asarray(index < (0 if change is None else change.onset))
+        return np.asarray(index >= index[-1:].min(initial=change.detected))  # or detected after the last evaluation
 
     @cached_property
     def alarm(self) -> npt.NDArray[np.bool_]:
@@ -374,9 +375,7 @@ def _noise_growth(pipeline: Pipeline, estimates: Estimates) -> float:
     quantile over time tells it from a fault, whose residual is large only until the estimate has followed.
     """
     settled = estimates.power[estimates.updates > 3.0 * pipeline.memory]
-    if not len(settled):
-        return 1.0
-    growth = float(np.quantile(settled, 0.1))
+    growth = float(np.quantile(settled, 0.1)) if len(settled) else 1.0
     return growth if growth > MIN_NOISE_GROWTH else 1.0
 
 
