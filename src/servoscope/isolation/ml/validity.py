@@ -22,7 +22,8 @@ BISECTIONS = 6
 def fit_exact_predictor(baseline: Baseline, recordings: Sequence[Recording]) -> ExactPredictorFit | None:
     """Return the noise that makes the innovations of healthy recordings likeliest, and what they leave unexplained.
 
-    None where the predictor cannot be written down. n_u is the loudest that the innovations allow: their likelihood has fallen by exp(-`LIKELIHOOD_DROP`) there.
+    None where the predictor cannot be written down. n_u is the loudest that the innovations allow: their likelihood has
+    fallen by exp(-`LIKELIHOOD_DROP`) there.
     """
     loop = baseline.loop
     begin = initial_noise(loop, recordings, baseline.healthy.noise)
