@@ -11,7 +11,8 @@ import numpy as np
 import servoscope as ss
 from accuracy.rig import FAULT_AT
 from accuracy.scenario import Numbers, Row
-from servoscope.diagnosis.diagnose import MIN_CERTAINTY, first_alarm
+from servoscope.diagnosis.diagnose import MIN_CERTAINTY
+from servoscope.diagnosis.recording_alarm import first_alarm
 from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.ml_refit import refit_candidates, refit_onset, refit_recording
 from servoscope.isolation.candidate import UNKNOWN, Candidate

@@ -40,8 +40,9 @@ def winch(seed: int) -> Recording:
     return clean(t, y, u, y, name=f"winch {seed}", sample_rate=RATE)
 
 
-def test_motion_that_does_not_tell_coefficients_apart_is_no_traceback() -> None:
-    told = ss.Loop.from_dict({"sample_rate": RATE, "plant": PLANT | {"offset": True}})
+@pytest.mark.parametrize("plant", [PLANT | {"offset": True}, {"kind": "axis"}])
+def test_motion_that_does_not_tell_coefficients_apart_is_no_traceback(plant: dict[str, Any]) -> None:
+    told = ss.Loop.from_dict({"sample_rate": RATE, "plant": plant})
     for count in (2, 4):
         try:
             learned = ss.learn(told, [winch(seed) for seed in range(count)], force=True)

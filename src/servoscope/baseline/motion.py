@@ -27,6 +27,7 @@ KIND_TOLERANCE = 0.05  # relative excess by which recordings of one kind of moti
 MIN_WINDOW_SHARE = 0.5  # of a window, from which what it holds of the recording's beginning counts
 MIN_MOTION_SHARE = 1e-3  # of the largest value of a quantity: below, r or y counts as still
 MIN_DIRECTION_SHARE = 1e-6  # of the mean square of a regressor: directions without motion say nothing
+AT_ONCE = 8192  # evaluations that are compared together
 SIGNALS = 2  # r and y
 MOMENTS = 3  # mean squares of position, speed and acceleration
 
@@ -52,11 +53,12 @@ class RecordedMotion:
     """The motion of a recording around each of its K evaluations, from sums over all samples that updated the estimate.
 
     `sums`, shape (K + 1, 1 + 6 + n n): their number, squares of position, speed and acceleration of r and of y behind
-    the loop's filter, and phi phi'.
+    the loop's filter, and phi phi'. `updates`, shape (K + 1,): their number, side by side in memory for a search.
     """
 
     pipeline: Pipeline
     sums: FloatArray
+    updates: FloatArray
 
     @classmethod
     def from_recording(cls, pipeline: Pipeline, recording: Recording, origin: float) -> RecordedMotion:
@@ -65,21 +67,26 @@ class RecordedMotion:
         n, every = pipeline.bank.n, pipeline.every
         evaluations = recording.samples // every
         sums = outofcore.empty((evaluations + 2, 1 + SIGNALS * MOMENTS + n * n))
-        sums[:] = 0.0
+        for rows in outofcore.iter_chunks(0, len(sums), sums):
+            sums[rows] = 0.0
         for rows in outofcore.iter_chunks(0, recording.samples):
             part = recording.rows(rows)
             columns = motion_columns(runners, part.r, part.u, part.y, part.restart, origin)
             which = np.arange(rows.start, rows.stop) // every
             first = np.flatnonzero(np.diff(which, prepend=-1))
             sums[which[first] + 1] += np.add.reduceat(columns, first, axis=0)
-            outofcore.release(*recording.columns)
-        np.cumsum(sums, axis=0, out=sums)
-        return cls(pipeline, sums[: evaluations + 1])
+            outofcore.release(*recording.columns, sums)
+        before = np.zeros(sums.shape[1])
+        for rows in outofcore.iter_chunks(0, len(sums), sums):
+            sums[rows] = before + np.cumsum(sums[rows], axis=0)
+            before = sums[rows.stop - 1].copy()
+        sums = sums[: evaluations + 1]
+        return cls(pipeline, sums, outofcore.copy_column(sums[:, 0]))
 
     def _means(self, at: slice, memories: float, centred: bool) -> tuple[FloatArray, FloatArray]:
         """Return means over the window of each of some evaluations, and the samples in it."""
-        updates, length = self.sums[:, 0], memories * self.pipeline.memory
-        end = np.arange(1, len(self.sums))[at]
+        updates, length = self.updates, memories * self.pipeline.memory
+        end = np.arange(*at.indices(len(updates) - 1)) + 1
         if centred:  # at the ends of a recording the window stays as long as it is
             upper = np.clip(updates[end] + length / 2.0, length, updates[-1])
             end = np.minimum(np.searchsorted(updates, upper), len(updates) - 1)
@@ -101,7 +108,9 @@ class RecordedMotion:
 
     def excess(self, seen: MotionRange, at: slice) -> FloatArray:
         """Return `motion_excess` at evaluations, shape (K, 4)."""
-        return motion_excess(self.pipeline, seen, *self.quantities(at))
+        chunks = outofcore.iter_chunks(*at.indices(len(self.sums) - 1)[:2], self.sums, at_once=AT_ONCE)
+        parts = [motion_excess(self.pipeline, seen, *self.quantities(rows)) for rows in chunks]
+        return np.concatenate(parts) if parts else np.empty((0, len(QUANTITIES)))
 
     def model_error(self, seen: MotionRange, tuning: Tuning, at: slice) -> FloatArray:
         """Return `model_error_covariance` at evaluations, shape (K, n, n)."""

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core import outofcore
-from servoscope.core.arrays import FloatArray
+from servoscope.core.arrays import FloatArray, IntArray
 from servoscope.core.messages import Message, message
 from servoscope.estimation.pipeline import Pipeline
 from servoscope.signals import Recording
@@ -97,10 +97,12 @@ def find_switched_off(recording: Recording) -> SignalDefect | None:
     """Return from where on the drive is off: u stays at 0 for long while y moves, and not as r asks it to."""
     u, span = recording.u, float(np.ptp(outofcore.extremes(recording.y)))
     silent = SILENCE_SHARE * float(np.abs(outofcore.extremes(u)).max())
-    off = np.zeros(recording.samples, dtype=np.bool_)
+    switches, was_off = list[IntArray](), False
     for rows in outofcore.iter_chunks(0, recording.samples, *recording.columns):
-        off[rows] = (np.abs(u[rows]) <= silent) & ~recording.restart[rows]
-    edges = np.flatnonzero(np.diff(off, prepend=False, append=False)).reshape(-1, 2)
+        off = (np.abs(u[rows]) <= silent) & ~recording.restart[rows]
+        switches.append(rows.start + np.flatnonzero(np.diff(off, prepend=was_off)))
+        was_off = bool(off[-1])
+    edges = np.concatenate([*switches, np.full(int(was_off), recording.samples)]).reshape(-1, 2)
     for begin, end in edges[np.diff(edges)[:, 0] > FROZEN_S * recording.sample_rate].tolist():
         y, e = recording.y[begin:end], recording.r[begin:end] - recording.y[begin:end]
         moved = float(np.ptp(y))

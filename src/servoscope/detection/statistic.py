@@ -16,8 +16,9 @@ def apply_alarm_delays(exceeded: BoolArray, on: int, off: int) -> BoolArray:
     if not exceeded.any():
         return exceeded
     k, raised = np.arange(len(exceeded)), consecutive_exceedances(exceeded) > on
-    last = np.maximum.accumulate(np.where(raised, k, -off - 1))
-    return np.asarray(k - last <= off)
+    last = np.where(raised, k, -off - 1)
+    np.maximum.accumulate(last, out=last)  # in place: a long recording has millions of evaluations
+    return np.asarray(np.subtract(k, last, out=last) <= off)
 
 
 def consecutive_exceedances(exceeded: BoolArray, before: int = 0) -> IntArray:
@@ -26,8 +27,9 @@ def consecutive_exceedances(exceeded: BoolArray, before: int = 0) -> IntArray:
     `before`: the same for the evaluation before the first one.
     """
     k = np.arange(len(exceeded))
-    below = np.maximum.accumulate(np.where(exceeded, -1 - before, k))  # last evaluation below the limit
-    return np.asarray(k - below)
+    below = np.where(exceeded, -1 - before, k)
+    np.maximum.accumulate(below, out=below)  # last evaluation below the limit
+    return np.asarray(np.subtract(k, below, out=below))
 
 
 @functools.lru_cache(1024)  # it takes a search, and a baseline asks for its own each time that it is examined

@@ -17,7 +17,7 @@ from servoscope.estimation.tuning import fit_tuning
 from servoscope.isolation.signature import Signature
 from servoscope.isolation.signatures import fault_signatures
 
-MAX_STRETCH_SAMPLES = 500_000  # samples of a stretch; more of them add nothing
+MAX_STRETCH_SAMPLES = 200_000  # of a stretch; more add nothing but memory
 HALF_STRETCH_TOLERANCE = 0.05  # stated relative deviation, up to which half a stretch is enough
 
 

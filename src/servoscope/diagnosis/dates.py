@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from servoscope.core.messages import Message, message
 
+TIMELINES = "diagnosis.timeline", "diagnosis.repaired"  # headlines that say from when to when
 DATED = {  # parts of the headline of a timeline: in seconds, and as dates
     "diagnosis.healed": "diagnosis.healed_date",
     "diagnosis.stretch_when": "diagnosis.stretch_when_date",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +15,7 @@ from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import RecordingError, SimulationError
 from servoscope.core.messages import Message, message
 from servoscope.detection.louder_noise import find_louder_noise
-from servoscope.detection.onset import Onset, estimate_onset
+from servoscope.detection.onset import Onset
 from servoscope.detection.signal_defects import find_signal_defect
 from servoscope.detection.trace import UNSEEN_EXCESS, Trace
 from servoscope.diagnosis import ml_refit
@@ -26,8 +25,9 @@ from servoscope.diagnosis.checks import what_to_check
 from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.explanation import build_headline, build_reasons, unwatched_changes
 from servoscope.diagnosis.motion_check import motion_warnings
-from servoscope.diagnosis.output_onset import refine_onset
 from servoscope.diagnosis.own_past import examine_by_own_past, own_past_warning
+from servoscope.diagnosis.recording_alarm import RecordingAlarm, first_alarm
+from servoscope.diagnosis.repair import is_repaired, repaired_interval
 from servoscope.diagnosis.result import (
     Diagnosis,
     DiagnosisWarning,
@@ -200,15 +200,15 @@ def _with_warnings(diagnosis: Diagnosis, more: Sequence[DiagnosisWarning]) -> Di
 
 
 def _first_alarm_time(exam: Examination) -> float:
-    alarms = np.flatnonzero(exam.apparent_alarm)
-    changed = exam.features_changed_s
-    return min(float(exam.t(alarms[0])) if alarms.size else np.inf, np.inf if changed is None else changed)
+    alarm, changed = exam.apparent_alarm, exam.features_changed_s
+    first = float(exam.t(int(alarm.argmax()))) if alarm.any() else np.inf
+    return min(first, np.inf if changed is None else changed)
 
 
 def largest_statistic_ratio(exam: Examination) -> float:
     """Return the largest value of all statistics, as a multiple of its limit."""
-    ratios = [statistic.value / statistic.limit for statistic in exam.statistics]
-    return float(np.maximum.reduce(ratios)[exam.ready].max(initial=0.0))
+    ratios = (statistic.value / statistic.limit for statistic in exam.statistics)
+    return max(float(ratio.max(where=exam.ready, initial=0.0)) for ratio in ratios)
 
 
 def _change_size(diagnosis: Diagnosis) -> float:
@@ -235,6 +235,7 @@ def diagnose_examination(
     if alarm is not None:
         at = alarm.evaluation
         intervals, onset, doubts = _explain_alarm(exam, alarm, progress)
+        verdict = "healthy" if is_repaired(exam, intervals) else verdict
         warnings = _all_warnings(exam, doubts + covariate_warnings(exam, at))
         headline = build_headline(verdict, intervals, {}, warnings, baseline.point)
     elif features is not None and changed is not None:
@@ -288,12 +289,16 @@ def _explain_alarm(
         return (ml_refit.vibration_interval(exam, exam.change.vibration),), alarm.onset, []
     onset, refit, doubts = alarm.onset, None, list[DiagnosisWarning]()
     recursive = candidates = isolate(*isolation_inputs(exam, onset, alarm.evaluation), lambda: progress("isolation"))
+    exam.release()
     progress("refit")
+    if exam.change is not None and exam.change.repaired:
+        past = repaired_interval(exam, recursive, MIN_CERTAINTY, lambda: progress("refit"))
+        return (past,), onset, []
     last = int(exam.estimates.index[alarm.evaluation])
     # the refit takes the model for exact, but that of an axis follows the recording
     seen = exam.change is not None or (
         not exam.drifts
-        and (exam.motion_excess(slice(int(np.flatnonzero(exam.alarm)[0]), alarm.evaluation + 1)) < UNSEEN_EXCESS).all()
+        and (exam.motion_excess(slice(int(exam.alarm.argmax()), alarm.evaluation + 1)) < UNSEEN_EXCESS).all()
     )
     refined = ml_refit.refit_recording(exam, onset, alarm.sample, last, lambda: progress("refit")) if seen else None
     if refined is not None and not _prefers_learned_fault(refined, recursive[0]):
@@ -337,42 +342,6 @@ def _onset_of(intervals: Sequence[FaultInterval], exam: Examination, alarm: Reco
     one = next((each for each in intervals if _covers(each, at)), intervals[-1])
     assert one.onset_s is not None
     return Onset(*one.onset_s, int(np.searchsorted(exam.recording.t, one.onset_s[1])))
-
-
-@dataclass(frozen=True)
-class RecordingAlarm:
-    """The alarm of a recording: its sample, the evaluation that is explained, and the onset by the recursion."""
-
-    sample: int
-    evaluation: int
-    onset: Onset
-
-
-def first_alarm(exam: Examination, progress: Callable[[str], None] = lambda _: None) -> RecordingAlarm | None:
-    """Return the first alarm of an examination; None if there was none."""
-    alarms = np.flatnonzero(exam.alarm)
-    if not alarms.size:
-        return None
-    first = int(alarms[0])
-    # the sequential test alarms at any sample, T^2 at its evaluations
-    crossed = int(exam.estimates.crossed[first]) - 1
-    at_once = crossed >= 0 and not exam.baseline.loop.monitor.on_delay
-    sample = crossed if at_once else int(exam.estimates.index[first])
-    # the last evaluation has forgotten most of the healthy past; where the alarm has gone, the strongest one
-    at = exam.evaluations - 1 if exam.alarm[-1] else first + int(np.argmax(exam.statistic[first:]))
-    progress("onset")
-    if (change := exam.change) is not None:
-        low, likely, high = (float(exam.recording.t[k]) for k in change.onset_interval)
-        return RecordingAlarm(change.detected, at, Onset(low, likely, high, change.onset))
-    onset = estimate_onset(
-        exam.pipeline,
-        exam.recording,
-        exam.expected[at],
-        exam.estimates.theta[at],
-        sample,
-        max(int(exam.estimates.index[at]), sample),
-    )
-    return RecordingAlarm(sample, at, refine_onset(exam, onset, sample, int(exam.estimates.index[at])))
 
 
 def _prefers_learned_fault(refined: RefitResult, recursive: Candidate) -> bool:

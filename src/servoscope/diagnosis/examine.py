@@ -97,7 +97,7 @@ class Examination:
             baseline = baseline.model_copy(update=followed)
         exam = _run_quickly(baseline, recording) if quick and along is None else None
         exam = exam or _run_recursion(baseline, recording, pipeline, along)
-        skipped = _skipped_share(exam.estimates)
+        skipped = exam.estimates.skipped_share
         replaced = _has_failed_instrument(exam)
         if replaced or skipped > MAX_SKIPPED_SHARE:
             other = loop.model_copy(update={"monitor": loop.monitor.model_copy(update=FALL_BACK)})
@@ -122,6 +122,12 @@ class Examination:
         theta = self.along.expected(self.estimates.index)
         C = np.broadcast_to(self.covariance(self.evaluations - 1), self.estimates.S.shape)
         return bool(t2_statistic(theta, np.broadcast_to(theta[-1], theta.shape), C).max() > MAX_COVARIATE_T2)
+
+    def release(self) -> None:
+        """Free the memory of a recording and of estimates that lie in files; they are read again where needed."""
+        moved = () if self.motion is None else (self.motion.sums, self.motion.updates)
+        estimated = (*vars(self.estimates).values(), self.statistic, self.expected)
+        outofcore.release(*self.recording.columns, *estimated, *moved)
 
     @property
     def evaluations(self) -> int:
@@ -175,10 +181,11 @@ class Examination:
 
     @property
     def _changed(self) -> npt.NDArray[np.bool_]:
-        """Whether a change within the recording had been detected, shape (K,)."""
-        found = self.estimates.index >= (self.recording.samples if self.change is None else self.change.detected)
-        found[-1:] |= self.change is not None  # it may be detected after the last evaluation
-        return np.asarray(found)
+        """Whether a change within the recording had been detected, or was not yet repaired, shape (K,)."""
+        change, index = self.change, self.estimates.index
+        if change is None or change.repaired:
+            return np.asarray(index < (0 if change is None else change.onset))
+        return np.asarray(index >= index[-1:].min(initial=change.detected))  # or detected after the last evaluation
 
     @cached_property
     def alarm(self) -> npt.NDArray[np.bool_]:
@@ -193,6 +200,7 @@ class Examination:
             # the sequential test knows no model error
             exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & (self.motion_excess(at) < UNSEEN_EXCESS))
         exceeded &= any_exceeded(self._of_coefficients)
+        self.release()
         return self._changed | apply_alarm_delays(exceeded, *self.pipeline.delays)
 
     @cached_property
@@ -367,9 +375,7 @@ def _noise_growth(pipeline: Pipeline, estimates: Estimates) -> float:
     quantile over time tells it from a fault, whose residual is large only until the estimate has followed.
     """
     settled = estimates.power[estimates.updates > 3.0 * pipeline.memory]
-    if not len(settled):
-        return 1.0
-    growth = float(np.quantile(settled, 0.1))
+    growth = float(np.quantile(settled, 0.1)) if len(settled) else 1.0
     return growth if growth > MIN_NOISE_GROWTH else 1.0
 
 
@@ -391,10 +397,3 @@ def _has_failed_instrument(exam: Examination) -> bool:
     if not own.any():
         return False
     return bool(np.linalg.eigvals(np.linalg.lstsq(own, shared, rcond=None)[0]).real.min() < MIN_INSTRUMENT_EIGENVALUE)
-
-
-def _skipped_share(estimates: Estimates) -> float:
-    if not len(estimates.updates):
-        return 0.0
-    skipped, updated = float(estimates.skipped[-1]), float(estimates.updates[-1])
-    return skipped / max(skipped + updated, 1.0)

@@ -45,7 +45,7 @@ def build_headline(
     `unwatched`: changes of which it would have shown nothing.
     """
     at = message("diagnosis.point", name=point) if point else None
-    if verdict == "healthy":
+    if verdict == "healthy" and not intervals:
         sizes = sorted((size, parameter) for parameter, (size, _) in detectable.items())
         smallest = tuple(message("diagnosis.smallest", parameter=parameter, size=size) for size, parameter in sizes)
         if not unwatched:
@@ -56,7 +56,7 @@ def build_headline(
         return undetermined_headline(reason, point)
     interval = intervals[-1]
     if interval.end_interval_s is not None or len(intervals) > 1:
-        return _timeline_headline(intervals, at)
+        return _timeline_headline("timeline" if verdict == "fault" else "repaired", intervals, at)
     since = _onset_message(interval)
     mimic = interval.refit.mimics[0].description if interval.refit and interval.refit.mimics else None
     if interval.faults:
@@ -85,11 +85,11 @@ def unwatched_changes(plant: Plant, detectable: Mapping[str, tuple[float, float]
     return (*parameters, *(message(f"cause.{kind}") for kind in plant.unwatched))
 
 
-def _timeline_headline(intervals: Sequence[FaultInterval], at: Message | None) -> Message:
+def _timeline_headline(key: str, intervals: Sequence[FaultInterval], at: Message | None) -> Message:
     """Say what happened from when to when, and whether it is over."""
     last = intervals[-1]
     now = None if last.end_s is None else message("diagnosis.healed", t=last.end_s)
-    return message("diagnosis.timeline", point=at, stretches=tuple(map(_stretch_message, intervals)), now=now)
+    return message(f"diagnosis.{key}", point=at, stretches=tuple(map(_stretch_message, intervals)), now=now)
 
 
 def _stretch_message(interval: FaultInterval) -> Message:

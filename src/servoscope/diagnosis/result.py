@@ -23,7 +23,7 @@ from servoscope.core.messages import (
     text_message,
 )
 from servoscope.core.short_repr import ShortRepr
-from servoscope.diagnosis.dates import date_timeline
+from servoscope.diagnosis.dates import TIMELINES, date_timeline
 from servoscope.isolation.candidate import Candidate, FaultEstimate, ResultModel
 from servoscope.signals import Defect, Recording
 from servoscope.signals.recording import frame_of
@@ -376,7 +376,7 @@ class Diagnosis(ShortRepr, ResultModel):
 
         `onset`: of a change that is older than the recording, where it is known [UTC s].
         """
-        if self.headline.key == "diagnosis.timeline":
+        if self.headline.key in TIMELINES:
             return date_timeline(self.headline, began)
         since = self.headline.values.get("since")
         if self.current.onset_s is None or not isinstance(since, Message):

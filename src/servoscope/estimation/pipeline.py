@@ -62,6 +62,12 @@ class Estimates:
     S: FloatArray  # its covariance under the recording's own excitation, shape (K, n, n)
     Psi: FloatArray  # share of the starting value that is left in it, shape (K, n, n)
 
+    @property
+    def skipped_share(self) -> float:
+        """The share of all updates that a guard refused."""
+        skipped, updated = self.skipped[-1:].sum(), self.updates[-1:].sum()
+        return float(skipped / max(skipped + updated, 1.0))
+
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:

@@ -11,6 +11,7 @@ from servoscope.baseline.axis_model import AxisModel
 from servoscope.baseline.baseline import Baseline
 from servoscope.isolation.ml.axis_vibration import BANDS, MIN_AMPLITUDE_RATIO, AxisVibration, find_vibration
 from servoscope.isolation.ml.axis_window import LONG_RUN_S, AxisWindow
+from servoscope.isolation.ml.goodness_of_fit import MISFIT_BY_CHANCE
 from servoscope.isolation.ml.hypothesis import HypothesisFit, fit_hypothesis
 from servoscope.isolation.ml.onset import ChangeCosts
 from servoscope.isolation.ml.window import ChangeProfile
@@ -36,6 +37,7 @@ class AxisChange:
     onset: int  # the most likely one
     detected: int  # when what had been measured by then was enough to tell it
     vibration: AxisVibration | None = None  # where not a coefficient changed; its onsets are samples of the recording
+    repaired: bool = False  # whether the axis was not what the baseline calls healthy before, and is so since
 
     @property
     def onset_interval(self) -> tuple[int, int, int]:
@@ -72,7 +74,23 @@ def _named_change(window: AxisWindow, found: _ChangeFit, limit: float, enough: f
     ends = vibration.onset if vibration else (onset, onset, onset)
     low, at, high = (window.first_sample + window.stride * k for k in ends)
     within = vibration and replace(vibration, onset=(low, at, high))
-    return AxisChange(at, window.first_sample + window.stride * told, within)
+    repaired = vibration is None and _is_repaired(window, onset)
+    return AxisChange(at, window.first_sample + window.stride * told, within, repaired)
+
+
+def _is_repaired(window: AxisWindow, onset: int) -> bool:
+    """Return whether the axis is healthy since a change, as far as recordings scatter, and was further away before."""
+    from scipy.special import chdtri
+
+    m, never = window.nuisance_count, ChangeProfile(window.samples)
+    before, after = (
+        fit_hypothesis(window.cut(*part), [], never, np.zeros(m), [np.zeros(0)], free=True).d
+        for part in ((0, onset), (onset, window.samples))
+    )
+    known = slice(len(window.model.parameters))  # offset and drift are each recording's own
+    off_before, off_after = (float(((window.prior[known, known] @ d[known]) ** 2).sum()) for d in (before, after))
+    most, least = (float(chdtri(max(dof, 1), MISFIT_BY_CHANCE)) for dof in (known.stop, 1))
+    return off_after < min(most, off_before - least)
 
 
 def largest_changes(loop: Loop, model: AxisModel, recording: Recording) -> tuple[float, float]:

@@ -16,6 +16,7 @@ from servoscope.core.errors import RecordingError, ServoscopeError
 from servoscope.core.messages import Message, message, render
 from servoscope.detection.covariate_monitor import CovariateHistory, fill_channels
 from servoscope.detection.warm_up import COURSE_CHANNELS
+from servoscope.diagnosis.dates import TIMELINES
 from servoscope.diagnosis.result import Verdict
 from servoscope.isolation.candidate import FaultEstimate
 from servoscope.service.sources.block import Block
@@ -54,7 +55,7 @@ class StoredDiagnosis(BaseModel):
 
     def with_onset(self, onset: float | None) -> StoredDiagnosis:
         """Return it with the onset [UTC s] that an earlier window has found, if its own window begins after that."""
-        if onset is not None and self.headline.key == "diagnosis.timeline":
+        if onset is not None and self.headline.key in TIMELINES:
             return self._with_timeline_from(onset)
         since = self.headline.values.get("since")
         if onset is None or since is None or since.key != "diagnosis.since_start_date":

@@ -1,0 +1,50 @@
+"""The alarm of a recording: when, the evaluation that is explained, and since when by the recursion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from servoscope.detection.onset import Onset, estimate_onset
+from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.output_onset import refine_onset
+
+
+@dataclass(frozen=True)
+class RecordingAlarm:
+    """The alarm of a recording: its sample, the evaluation that is explained, and the onset by the recursion."""
+
+    sample: int
+    evaluation: int
+    onset: Onset
+
+
+def first_alarm(exam: Examination, progress: Callable[[str], None] = lambda _: None) -> RecordingAlarm | None:
+    """Return the first alarm of an examination; None if there was none."""
+    if not exam.alarm.any():
+        return None
+    first = int(exam.alarm.argmax())
+    # the sequential test alarms at any sample, T^2 at its evaluations
+    crossed = int(exam.estimates.crossed[first]) - 1
+    at_once = crossed >= 0 and not exam.baseline.loop.monitor.on_delay
+    sample = crossed if at_once else int(exam.estimates.index[first])
+    # the last evaluation has forgotten most of the healthy past; where the alarm has gone, the strongest one
+    at = exam.evaluations - 1 if exam.alarm[-1] else first + int(np.argmax(exam.statistic[first:]))
+    progress("onset")
+    if (change := exam.change) is not None and change.repaired:
+        began = float(exam.recording.t[0])
+        return RecordingAlarm(sample, at, Onset(began, began, began, 0))
+    if change is not None:
+        low, likely, high = (float(exam.recording.t[k]) for k in change.onset_interval)
+        return RecordingAlarm(change.detected, at, Onset(low, likely, high, change.onset))
+    onset = estimate_onset(
+        exam.pipeline,
+        exam.recording,
+        exam.expected[at],
+        exam.estimates.theta[at],
+        sample,
+        max(int(exam.estimates.index[at]), sample),
+    )
+    return RecordingAlarm(sample, at, refine_onset(exam, onset, sample, int(exam.estimates.index[at])))

@@ -1,0 +1,70 @@
+"""A machine that was worn and is repaired within the recording: healthy, with a finding in the past."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+import pytest
+
+import servoscope as ss
+from servoscope.service.assets.examination import StoredDiagnosis, diagnose_blocks, examine_blocks
+from servoscope.service.sources.block import Block
+from servoscope.simulation import FaultEvent, reference, simulate
+from servoscope.simulation.tutorial import AXIS
+
+PLANT: dict[str, Any] = {"kind": "axis", "terms": ["viscous", "coulomb"], "coefficients": {
+    "inertia": 1.0, "viscous_friction": 10.0, "coulomb_friction": 2.0}}  # fmt: skip
+WORN = FaultEvent("coulomb_friction", 1.5, 0.0), FaultEvent("coulomb_friction", 1.0, 28.0)
+
+
+@pytest.fixture(scope="module")
+def baseline() -> ss.Baseline:
+    loop = ss.Loop.from_dict({**AXIS, "plant": PLANT})
+    return ss.learn(loop, [moved(loop, seed) for seed in range(2)])
+
+
+def moved(loop: ss.Loop, seed: int, *faults: FaultEvent) -> ss.Recording:
+    t = np.arange(10_000) / 200.0
+    r = 0.1 * np.sin(3.0 * t) + 0.05 * np.sin(7.0 * t)
+    return simulate(loop, r, seed=seed, faults=faults, noise_u_std=5e-3, noise_y_std=1e-5)[0]
+
+
+def test_an_axis_that_was_worn_until_its_repair(baseline: ss.Baseline) -> None:
+    found = ss.diagnose(baseline, moved(baseline.loop, 7, *WORN))
+    assert found.verdict == "healthy"
+    assert found.summary.startswith(
+        "Healthy, with a finding in the past: dry friction from the start or before to 28.0 s"
+    )
+    assert found.summary.endswith("; healthy again since 28.0 s.")
+    (interval,) = found.intervals
+    (fault,) = interval.faults
+    assert fault.interval[0] <= 1.5 <= fault.interval[1]
+    assert interval.end_interval_s is not None and interval.end_interval_s[0] <= 28.0 <= interval.end_interval_s[2]
+    assert "since when" not in str(found).splitlines()[0]
+
+
+def test_a_linear_plant_that_was_worn_until_its_repair() -> None:
+    loop = ss.Loop.load(str(files("servoscope") / "simulation" / "reference-rig.toml"))
+    r = reference("multisine", 60.0, loop.sample_rate)
+    worn = FaultEvent("C_ie", 1.5, 0.0), FaultEvent("C_ie", 1.0, 28.0)
+    found = ss.diagnose(ss.learn(loop, [simulate(loop, r, seed=0)[0]]), simulate(loop, r, seed=7, faults=worn)[0])
+    assert (found.verdict, found.intervals[0].end_s) == ("healthy", pytest.approx(28.0, abs=0.1))
+    assert "leakage" in found.summary
+
+
+def test_the_headline_of_a_repaired_asset_becomes_healthy(baseline: ss.Baseline) -> None:
+    """The window that holds the repair raises no fault, and the next one, behind it, is healthy."""
+    recording = moved(baseline.loop, 7, *WORN)
+    signals = np.array([recording.t, recording.r, recording.u, recording.y])
+
+    def live(first: int, end: int) -> StoredDiagnosis:
+        return examine_blocks(baseline, "axis", [Block.from_signals("axis", 0, signals[:, first:end])])
+
+    assert live(0, 4800).verdict == "fault"
+    assert live(1600, 9600).recovering
+    assert live(5700, 10_000).verdict == "healthy"
+    full = diagnose_blocks(baseline, "axis", [Block.from_signals("axis", 0, signals)])
+    assert full.verdict == "healthy" and full.headline.key == "diagnosis.repaired"
+    assert "to 1970-01-01 00:00:28" in full.summary
