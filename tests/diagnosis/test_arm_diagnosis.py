@@ -17,6 +17,7 @@ from servoscope.cli import app
 from servoscope.core.errors import BaselineError, NotEnoughError, RecordingError
 from servoscope.diagnosis.arm import diagnose_arm, examine_arm
 from servoscope.learning.arm import learn_arm
+from servoscope.learning.arm_setup import calibrate_load
 from servoscope.models.arm.settings import ArmLoop
 from servoscope.models.arm.urdf import parse_urdf
 from servoscope.report.arm_page import render_arm_page
@@ -195,11 +196,44 @@ def test_the_commands_take_an_arm(tmp_path: Path) -> None:
     write_example(tmp_path)
     days = [str(tmp_path / f"day{day}.csv") for day in (1, 2, 3)]
     run = CliRunner().invoke
+    proposed = run(
+        app, ["init", days[0], "--urdf", str(tmp_path / "six_joints.urdf"), "-o", str(tmp_path / "own.toml")]
+    )
+    assert proposed.exit_code == 0 and ArmLoop.load(tmp_path / "own.toml")[0].joints["elbow"].torque == "i3"
     learned = run(app, ["learn", str(tmp_path / "arm.toml"), *days, "-o", str(tmp_path / "arm.json")])
     assert learned.exit_code == 0 and "base_yaw" in learned.output
     logs = [str(tmp_path / "tuesday.csv"), str(tmp_path / "pallet.csv")]
     told = run(app, ["diagnose", str(tmp_path / "arm.json"), *logs, "--fail-on-fault"])
     assert told.exit_code == 3, told.output
     assert "friction of elbow" in told.output and "the payload changed" in told.output
+    calibrate = ["calibrate-load", str(tmp_path / "arm.json"), logs[1], "--mass", "2", "-o", str(tmp_path / "c.toml")]
+    calibrated = run(app, calibrate)
+    assert calibrated.exit_code == 0, calibrated.output
+    loop, _ = ArmLoop.load(tmp_path / "c.toml")
+    assert loop.gains == "load" and loop.joints["shoulder"].gain == pytest.approx(GAINS[1], rel=0.1)
     refused = run(app, ["diagnose", str(tmp_path / "arm.json"), *logs, "--from", "3"])
     assert refused.exit_code == 2 and "not for an arm" in refused.output
+
+
+def test_a_load_of_known_mass_gives_the_drive_gains(ur10e: tuple[ArmBaseline, Callable[[str], ArmRecording]]) -> None:
+    """One pair of logs calibrates, the other is judged: without and with 2.805 kg."""
+    baseline, record = ur10e
+    gains = calibrate_load(baseline, record("identification_data__ur-20_02_19_14harm50secLoad"), 2.805)
+    assert [gain.joint for gain in gains if not gain.determined] == ["shoulder_pan_joint"]
+    joints = {
+        gain.joint: baseline.loop.joints[gain.joint].model_copy(update={"gain": gain.gain} if gain.determined else {})
+        for gain in gains
+    }
+    loop = baseline.loop.model_copy(update={"joints": joints, "gains": "load"})
+    ratio = np.array([joints[name].gain / joint.gain for name, joint in baseline.loop.joints.items()])
+
+    def scaled(name: str) -> ArmRecording:
+        recording = record(name)
+        return replace(recording, torque=recording.torque * ratio)
+
+    calibrated = learn_arm(loop, baseline.urdf, [scaled(source.name.removesuffix(".parquet")) for source in baseline.sources])
+    diagnosis = diagnose_arm(calibrated, scaled("identification_data__ur-20_02_19_15harm50secLoad"))
+    assert diagnosis.verdict == "healthy" and not diagnosis.warnings
+    (fault,) = diagnosis.faults
+    assert fault.mass_kg is not None and fault.mass_kg[1] < 2.805 < fault.mass_kg[2]
+    assert fault.mass_kg[0] == pytest.approx(2.805, rel=0.1)

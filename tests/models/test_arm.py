@@ -5,9 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from servoscope.core.errors import LoopError, RecordingError
+from servoscope.learning.arm_setup import propose_arm_loop
 from servoscope.models.arm.dynamics import torque_regressor
 from servoscope.models.arm.model import ArmModel
 from servoscope.models.arm.settings import ArmLoop, describes_arm
@@ -129,3 +132,45 @@ def test_motor_angles_become_joint_angles() -> None:
     assert np.abs(recording.q - q).max() < 1e-6
     assert np.abs(recording.torque - (currents * GAINS) @ gears).max() < 1e-2
     assert len(ArmModel(arm, loop).coupled) == 1
+
+
+ROBOTS = {  # what robots log: positions, torques or currents, and what else looks like them
+    "UR": ("actual_q_{0}", "actual_current_{0}", ("target_q_{0}", "target_current_{0}", "actual_qd_{0}")),
+    "KUKA": ("AIPos.A{1}", "MACur.A{1}", ("ASPos_target.A{1}",)),
+    "Franka": ("q[{0}]", "tau_J[{0}]", ("dq[{0}]", "q_d[{0}]", "dtau_J[{0}]")),
+    "ROS 2": ("position[{0}]", "effort[{0}]", ("velocity[{0}]",)),
+    "by name": ("{2}/pos", "{2}/torque", ("{2}/vel",)),
+}
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_a_loop_file_is_proposed_from_what_robots_log(robot: str, tmp_path: Path) -> None:
+    position, torque, others = ROBOTS[robot]
+    t = np.arange(1000) / 100.0
+    log = {"time": t}
+    for j, joint in enumerate(simulated_arm().names):
+        log |= {other.format(j, j + 1, joint): np.cos(t) for other in others}
+        log[position.format(j, j + 1, joint)] = np.sin(t + j) * (100.0 if robot == "KUKA" else 1.0)
+        log[torque.format(j, j + 1, joint)] = np.cos(t - j)
+    pq.write_table(pa.table(log), tmp_path / "log.parquet")
+    (tmp_path / "arm.urdf").write_bytes(URDF.read_bytes())
+    loop, _ = propose_arm_loop(tmp_path / "log.parquet", tmp_path / "arm.urdf", "arm.urdf")
+    assert loop.sample_rate == 100.0 and loop.angle_unit == ("deg" if robot == "KUKA" else "rad")
+    assert [joint.position.strip("`") for joint in loop.joints.values()] == [
+        position.format(j, j + 1, name) for j, name in enumerate(loop.joints)
+    ]
+    assert [joint.torque.strip("`") for joint in loop.joints.values()] == [
+        torque.format(j, j + 1, name) for j, name in enumerate(loop.joints)
+    ]
+    written = tmp_path / "arm.toml"
+    written.write_text(loop.to_toml({}), encoding="utf-8")
+    assert ArmLoop.load(written)[0] == loop
+
+
+def test_a_log_without_the_joints_of_the_urdf_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_bytes(URDF.read_bytes())
+    (tmp_path / "log.csv").write_text("t,q1,i1\n0,1,2\n0.01,1,2\n")
+    with pytest.raises(
+        RecordingError, match=r"no positions of 6 joints in it: name its columns by the joints \(base_yaw"
+    ):
+        propose_arm_loop(tmp_path / "log.csv", tmp_path / "arm.urdf", "arm.urdf")

@@ -144,6 +144,14 @@ class ArmBaseline(BaselineModel):
         return deviation_columns(self.model, signals, design, np.array(self.theta))
 
     @cached_property
+    def random_effect(self) -> FloatArray:
+        """The information (P + D, P + D) of what coefficients are off, and of how recordings differ."""
+        size = len(self.theta)
+        prior = np.diag(np.concatenate([np.zeros(size), np.array(self.between) ** -2.0]))
+        prior[:size, :size] = self.information
+        return prior
+
+    @cached_property
     def causes(self) -> tuple[ArmCause, ...]:
         """The changes that are told apart."""
         return arm_causes(self.model)

@@ -24,7 +24,7 @@ CONTEXT = {"help_option_names": ["-h", "--help"]}
 
 GROUPS = {
     "Begin": ("demo", "tutorial", "init", "inspect", "docs", "help"),
-    "Judge recordings": ("assess", "learn", "baseline", "diagnose", "verify"),
+    "Judge recordings": ("assess", "learn", "baseline", "calibrate-load", "diagnose", "verify"),
     "Follow machines for months": (
         "add",
         "run",

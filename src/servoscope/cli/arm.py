@@ -1,15 +1,17 @@
-"""What learn, diagnose and init do with an arm, thin: parse, call, print."""
+"""The command that calibrates an arm, and what init, learn and diagnose do with one, thin: parse, call, print."""
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from servoscope.cli.app import app
 from servoscope.cli.exit import EXIT_FAULT, FailureCounter, print_json
-from servoscope.cli.output_paths import OutputPaths
+from servoscope.cli.output_paths import OutputPaths, check_output
 
 if TYPE_CHECKING:
     from servoscope.baseline.arm import ArmBaseline
@@ -20,6 +22,67 @@ def refuse_options(options: Mapping[str, object]) -> None:
     given = [name for name, value in options.items() if value]
     if given:
         raise typer.BadParameter(f"{', '.join(given)}: not for an arm, leave out")
+
+
+def write_proposal(logs: Sequence[Path], urdf: Path, output: Path, replace: bool) -> None:
+    """Propose the loop file of an arm from a log and its URDF, write it, and print it."""
+    import os
+
+    from servoscope.cli.render import results
+    from servoscope.core.errors import OutputError
+    from servoscope.core.files import atomic_write
+    from servoscope.core.messages import render
+    from servoscope.learning.arm_setup import propose_arm_loop
+    from servoscope.report.page import say
+
+    if output.exists() and not replace:
+        raise OutputError(f"{output}: exists; name another file with -o, or replace it with --yes")
+    loop, why = propose_arm_loop(logs[0], urdf, os.path.relpath(urdf, output.parent))
+    text = loop.to_toml({key: render(reason) for key, reason in why.items()})
+    atomic_write(output, text.encode())
+    out = results.create_console()
+    typer.echo(text)
+    results.print_written_path(out, output)
+    learn = shlex.join(["servoscope", "learn", str(output), *map(str, logs), "-o", "baseline.json"])
+    results.print_command(out, say("init.next"), learn)
+
+
+@app.command("calibrate-load")
+def calibrate(
+    baseline: Annotated[Path, typer.Argument(metavar="BASELINE", help="Of an arm, learned without the load.")],
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log of moves with the load.")],
+    mass: Annotated[float, typer.Option(metavar="KG", min=0.01, help="Mass of the load [kg].")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="LOOP", help="Loop file to write.")],
+) -> None:
+    """Find the drive gains of an arm from a load of known mass, and write its loop file with them."""
+    check_output(output, "-o", (".toml",), [baseline, log])
+
+    from servoscope.baseline.arm import ArmBaseline
+    from servoscope.cli.render import results
+    from servoscope.core.errors import BaselineError
+    from servoscope.core.files import atomic_write
+    from servoscope.learning.arm_setup import calibrate_load
+    from servoscope.report.page import say
+    from servoscope.signals.readers.arm_log import read_arm_log
+
+    if (healthy := ArmBaseline.load(baseline)) is None:
+        raise BaselineError(f'{baseline}: is no baseline of an arm, give one that learn wrote for kind = "arm"')
+    loop = healthy.loop
+    gains = calibrate_load(healthy, read_arm_log(log, loop, healthy.model.arm), mass)
+    joints = {
+        gain.joint: loop.joints[gain.joint].model_copy(
+            update={"gain": float(f"{gain.gain:.4g}")} if gain.determined else {}
+        )
+        for gain in gains
+    }
+    calibrated = loop.model_copy(update={"joints": {name: joints[name] for name in loop.joints}, "gains": "load"})
+    atomic_write(output, calibrated.to_toml({}).encode())
+    out = results.create_console()
+    rows = [(gain.joint, f"{gain.gain:.4g} ± {1.96 * gain.std * abs(gain.gain):.2g}") for gain in gains]
+    results.print_table(out, ("joint", "drive gain"), rows)
+    open_joints = [gain.joint for gain in gains if not gain.determined]
+    results.print_notes(out, [say("arm.gain_open", joints=open_joints)] if open_joints else [])
+    results.print_written_path(out, output)
 
 
 def learn_baseline(loop: Path, logs: Sequence[Path], output: Path, as_json: bool) -> None:

@@ -12,6 +12,7 @@ EXAMPLES = {
     "baseline log": "servoscope baseline log baseline.json",
     "baseline diff": "servoscope baseline diff earlier.json baseline.json",
     "baseline back": "servoscope baseline back baseline.json --why 'it was not run in yet'",
+    "calibrate-load": "servoscope calibrate-load arm.json loaded.csv --mass 2.8 -o calibrated.toml",
     "diagnose": "servoscope diagnose baseline.json friday.csv --report friday.html",
     "verify": "servoscope verify friday.json friday.csv baseline.json",
     "add": "servoscope add hall.toml press baseline.json --source line",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servoscope.cli import arguments
+from servoscope.cli import arguments, arm
 from servoscope.cli.app import app
 from servoscope.cli.exit import FailureCounter
 from servoscope.cli.options import ReadingOptions, with_reading_options
@@ -34,10 +34,15 @@ def init(
     *,
     reading: ReadingOptions,
     yes: Annotated[bool, typer.Option("--yes", help="Take what is proposed; ask nothing.")] = False,
+    urdf: Annotated[Path | None, typer.Option(metavar="FILE", help="Of a robot arm: its URDF.")] = None,
 ) -> None:
     """Look at logs, compare plants, propose a loop file with the evidence for each line, write it, inspect the logs."""
     logs = arguments.expand_files(logs)
     check_output(output, "-o", (".toml",), logs)
+    if urdf is not None:
+        arm.refuse_options(reading.given())
+        arm.write_proposal(logs, urdf, output, yes)
+        return
 
     from servoscope.cli.render import results
     from servoscope.core.errors import OutputError, ServoscopeError

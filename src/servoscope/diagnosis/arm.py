@@ -58,20 +58,19 @@ def examine_arm(baseline: ArmBaseline, recording: ArmRecording) -> tuple[Diagnos
     outside = outside_torque(signals, design, residual, model, theta)
     events = find_events(signals.t, outside, np.array(baseline.event_limits) * noise, model.arm.names)
     columns = np.concatenate([design, baseline.deviations(signals, design)], axis=1)
-    prior = _random_effect(baseline)
-    moved, information, evidence = _weigh(baseline, signals, columns, residual, prior, events)
+    moved, information, evidence = _weigh(baseline, signals, columns, residual, events)
     if events and evidence is not None and evidence.log_factor > baseline.limit:
         # what differs without them is a change, of which they are the peaks
         events = []
-        moved, information, evidence = _weigh(baseline, signals, columns, residual, prior, events)
+        moved, information, evidence = _weigh(baseline, signals, columns, residual, events)
     warnings = [*_event_warnings(events), *_still_warnings(model.arm.names, moved, recording)]
     if evidence is None or information is None:
         headline = message("arm.undetermined_pushed" if events else "arm.undetermined")
         return _result(recording, "undetermined", headline, warnings), ArmExamination(signals, outside, None, events)
     examination = ArmExamination(signals, outside, evidence, events)
-    parameters = _coefficients(baseline, information, prior)
+    parameters = _coefficients(baseline, information)
     if evidence.log_factor <= baseline.limit:
-        smallest = _smallest_changes(baseline, information, prior, moved)
+        smallest = _smallest_changes(baseline, information, moved)
         headline = message("arm.healthy_pushed" if events else "arm.healthy", smallest=smallest)
         return _result(recording, "healthy", headline, warnings, parameters), examination
     verdict, headline, interval, reasons = _explain(baseline, evidence)
@@ -88,7 +87,6 @@ def _weigh(
     signals: ArmSignals,
     columns: FloatArray,
     residual: FloatArray,
-    prior: FloatArray,
     events: list[ArmEvent],
 ) -> tuple[BoolArray, Information | None, ChangeEvidence | None]:
     """Return which joints moved (n,) outside of events, and the evidence of that; None where none did."""
@@ -99,16 +97,7 @@ def _weigh(
     w = signals.moving * clear / (np.array(baseline.noise) * np.sqrt(baseline.inflation))[:, None]
     information = block_information(signals.t, columns * w[:, None], residual * w)
     scale, drift = np.array(baseline.scale), np.array(baseline.drift)
-    return moved, information, ChangeTest(information, prior, baseline.causes, scale, drift).weigh()
-
-
-def _random_effect(baseline: ArmBaseline) -> FloatArray:
-    """Return the information (P + D, P + D) of what coefficients are off, and of how recordings differ."""
-    known, between = np.array(baseline.information), np.array(baseline.between)
-    prior = np.zeros((known.shape[0] + between.size,) * 2)
-    prior[: known.shape[0], : known.shape[0]] = known
-    prior[known.shape[0] :, known.shape[0] :] = np.diag(between**-2.0)
-    return prior
+    return moved, information, ChangeTest(information, baseline.random_effect, baseline.causes, scale, drift).weigh()
 
 
 def _result(
@@ -146,9 +135,9 @@ def _still_warnings(names: Sequence[str], moved: BoolArray, recording: ArmRecord
         yield _warning("rest", recording.t[0], recording.t[-1], message("arm.still", joints=still))
 
 
-def _coefficients(baseline: ArmBaseline, information: Information, prior: FloatArray) -> dict[str, FinalCoefficient]:
+def _coefficients(baseline: ArmBaseline, information: Information) -> dict[str, FinalCoefficient]:
     """Return friction and offset of each joint as the whole recording shows them."""
-    covariance = np.linalg.inv(information.A.sum(0) + prior)
+    covariance = np.linalg.inv(information.A.sum(0) + baseline.random_effect)
     shift, first = covariance @ information.g.sum(0), len(baseline.theta)
     found = {}
     for cause in baseline.causes:
@@ -161,13 +150,11 @@ def _coefficients(baseline: ArmBaseline, information: Information, prior: FloatA
     return found
 
 
-def _smallest_changes(
-    baseline: ArmBaseline, information: Information, prior: FloatArray, moved: BoolArray
-) -> list[Message]:
+def _smallest_changes(baseline: ArmBaseline, information: Information, moved: BoolArray) -> list[Message]:
     """Return the smallest payload and friction that would have been found in this recording from its start on."""
     first, scale = len(baseline.theta), np.array(baseline.scale)
     A = information.A.sum(0)
-    known = A - A @ np.linalg.solve(A + prior, A)
+    known = A - A @ np.linalg.solve(A + baseline.random_effect, A)
     variance = 1.0 / np.maximum(np.diag(known)[first:], 1e-300) + np.array(baseline.drift) ** 2
     # of one column alone: c^2 / 2 over its variance has to exceed the limit and what the choice among causes, onsets
     # and sizes costs
@@ -255,9 +242,9 @@ def _onset(evidence: ChangeEvidence, best: CauseEvidence) -> tuple[tuple[float, 
     ends = np.searchsorted(below, [ONSET_TAIL, 1.0 - ONSET_TAIL])
     low, high = (min(int(end), below.size - 1) for end in ends)
     likely = int(best.onset.argmax())
-    # the change lies somewhere in the block before the first that has it throughout
-    first = float(evidence.t[max(0, low - 1)])
-    return (first, float(evidence.t[likely]), float(evidence.t[high])), low == 0
+    # a change within a block: either this or the next is the first that is better explained with it
+    first, last = evidence.t[max(0, low - 1)], evidence.t[min(high + 1, evidence.t.size - 1)]
+    return (float(first), float(evidence.t[likely]), float(last)), low == 0
 
 
 def _fault(baseline: ArmBaseline, found: CauseEvidence) -> FaultEstimate | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -97,6 +98,19 @@ class ArmLoop(Settings):
             return cls.model_validate(dict(mapping))
         except ValidationError as error:
             raise LoopError(f"{source}: {describe_error(error, cls)}") from None
+
+    def to_toml(self, reasons: Mapping[str, str]) -> str:
+        """Return the loop file; `reasons`: comments by key, those of a joint by ``joint.key``."""
+        table = self.model_dump(mode="json", exclude_unset=True)
+        sections = [("", {key: value for key, value in table.items() if key != "joints"}), *table["joints"].items()]
+        lines = []
+        for joint, values in sections:
+            lines += ["", f"[joints.{json.dumps(joint)}]"] if joint else []
+            for key, value in values.items():
+                line = f"{key} = {json.dumps(value, ensure_ascii=False)}"
+                why = reasons.get(f"{joint}.{key}".lstrip("."))
+                lines.append(f"{line:<40}  # {why}" if why else line)
+        return "\n".join(lines) + "\n"
 
     def kinematics(self, urdf: str, source: str) -> Kinematics:
         """Return the arm of a URDF's text; raises LoopError if its moving joints are not those of the file."""
