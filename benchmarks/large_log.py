@@ -73,7 +73,7 @@ def main() -> None:
         size = (folder / "day.csv").stat().st_size
         steps = (
             ("init", "day.csv", "--yes"),
-            ("inspect", "loop.toml", "day.csv"),
+            ("inspect", "day.csv", "--loop", "loop.toml"),
             ("learn", "loop.toml", "day.csv", "-o", "baseline.json"),
             ("diagnose", "baseline.json", "day.csv"),
             ("diagnose", "baseline.json", "leak.csv"),
