@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -310,6 +311,19 @@ def test_many_repetitions_of_the_reference_change_no_cutoff(rig: dict[str, Any])
     found = inspect(simulate(Loop.from_dict(rig), repeated)[0])
     assert found.suggested_cutoff_hz == 10.0
     assert found.band is not None and found.band.low_hz < 0.1 and found.band.high_hz > 15.0
+
+
+def test_a_long_recording_is_judged_by_stretches_of_it(rig: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = recorded(rig, "multisine", 100.0)
+    whole = inspect(recording, Loop.from_dict(rig))
+    module = sys.modules[inspect.__module__]
+    monkeypatch.setattr(module, "MAX_ROWS", 8000)
+    monkeypatch.setattr(module, "MIN_STRETCH_ROWS", 3000)
+    found = inspect(recording, Loop.from_dict(rig))
+    assert found.sampling == whole.sampling and found.verdict == whole.verdict == "usable"
+    assert [str(finding.message) for finding in found.findings if finding.kind == "long"] == [
+        "8000 of 10000 rows were analysed, in evenly spread stretches"
+    ]
 
 
 def test_period_of_the_reference(rig: dict[str, Any]) -> None:
