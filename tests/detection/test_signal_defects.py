@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import servoscope as ss
 from servoscope.core.errors import RecordingError
@@ -77,10 +78,26 @@ def test_learn_refuses_them(defect: str, words: str) -> None:
 
 def test_a_step_after_the_dead_time_of_the_loop_is_no_counter_that_wraps() -> None:
     r = np.where(np.arange(2000) // 200 % 2 > 0, 1.0, -1.0)
-    y = np.roll(r, 5) + 1e-3 * np.random.default_rng(1).normal(size=2000)
-    recording = ss.read({"t": np.arange(2000) / 100.0, "r": r, "u": r, "y": y})
-    assert find_signal_defect(recording) is not None
-    assert find_signal_defect(recording, delay_s=0.05) is None
+    noise = 1e-3 * np.random.default_rng(1).normal(size=2000)
+
+    def late(samples: int) -> ss.Recording:
+        return ss.read({"t": np.arange(2000) / 100.0, "r": r, "u": r, "y": np.roll(r, samples) + noise})
+
+    assert find_signal_defect(late(6)) is None  # a hobby servo of which no delay was declared
+    assert find_signal_defect(late(30)) is not None
+    assert find_signal_defect(late(30), delay_s=0.3) is None
+
+
+def test_a_slow_loop_that_answers_after_two_samples_is_not_stuck() -> None:
+    """At 0.1 Hz a second is less than a sample: y rests exactly until it answers a step of the set point."""
+    k = np.arange(600)
+    r = np.where(k // 60 % 2 > 0, 1.0, -1.0)
+    late = np.where((k - 2) // 60 % 2 > 0, 1.0, -1.0)
+    y = np.round(lfilter([0.3], [1.0, -0.7], late), 2)
+    recording = ss.read({"t": 10.0 * k, "r": r, "u": r - y, "y": y})
+    assert find_signal_defect(recording) is None
+    defect = find_signal_defect(replace(recording, y=np.where(k < 300, y, y[300])))
+    assert defect is not None and defect.begin <= 300
 
 
 def test_a_rest_before_the_command_is_not_counted_as_stuck() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 
 import servoscope as ss
 from servoscope.isolation.isolate import isolate
+from servoscope.isolation.ml.search import onset_window
+from servoscope.isolation.ml.window import RefitWindow
 from servoscope.isolation.signature import parameter_signature
 from servoscope.models.plants import Fault
 from servoscope.models.plants.axis import AxisPlant
@@ -74,3 +77,11 @@ def test_a_size_that_may_be_healthy_is_no_explanation() -> None:
     first, second = isolate([signature], np.array([0.1, 3.0]), np.eye(2))
     assert (first.name, first.probability) == ("unknown", 1.0)
     assert second.faults[0].may_be_healthy and second.probability == 0.0
+
+
+def test_a_slow_loop_is_refitted_over_as_many_samples_as_a_fast_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RefitWindow, "from_recording", lambda _baseline, _recording, first, end: (first, end))
+    linear: Any = SimpleNamespace(axis=None)
+    for rate, span in ((0.1, (9400, 12400)), (10.0, (9400, 12400)), (100.0, (4000, 34000))):
+        recording: Any = SimpleNamespace(sample_rate=rate)
+        assert onset_window(linear, recording, 10_000, 100_000) == span

@@ -21,6 +21,7 @@ SCRIPTS = sorted((PROJECT / "scripts").glob("*.py"))
 AT_THE_TOP = {"__init__.py", "__main__.py", "py.typed"}
 HEAVY = ("numba", "scipy", "matplotlib", "pyarrow", "h5py", "pandas", "jinja2")
 LONG, TOO_LONG = 300, 400
+LONG_FUNCTION = 60
 ONE_SUBJECT = {  # files of one subject that is read together
     "src/servoscope/signals/readers/recording_file.py": 450,
     "benchmarks/hostile/targets.py": 450,
@@ -247,6 +248,20 @@ def test_no_file_is_too_long() -> None:
     lengths = {name: text.count("\n") for name, text in texts().items()}
     long = [f"{name}: {lines}" for name, lines in lengths.items() if lines > ONE_SUBJECT.get(name, TOO_LONG)]
     assert not long, f"past {LONG} lines a file is usually two, past {TOO_LONG} always:{listing(long)}"
+
+
+def test_no_step_of_learning_or_diagnosis_is_a_long_function() -> None:
+    long = []
+    for source in (source for source in SOURCES if source.path.parts[0] in ("learning", "diagnosis")):
+        for node in ast.walk(source.tree):
+            if isinstance(node, ast.FunctionDef):
+                described = node.body[0] if ast.get_docstring(node) else None
+                lines = node.end_lineno - node.lineno + 1
+                lines -= described.end_lineno - described.lineno + 1 if described else 0
+                long += [f"{source.path}: {node.name}: {lines}"] if lines > LONG_FUNCTION else []
+    assert not long, (
+        f"a function of more than {LONG_FUNCTION} lines, its docstring apart, is several steps:{listing(long)}"
+    )
 
 
 def test_few_files_are_long() -> None:

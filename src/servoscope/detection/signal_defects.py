@@ -21,14 +21,16 @@ FACTORS = (*(10.0**k for k in range(1, 7)), 25.4, 180.0 / np.pi, 2.0 * np.pi, 60
 MIN_RESIDUAL_RATIO = 5.0  # times smaller is the residual of the healthy plant where the signals are put right
 # the same where that residual is the healthy one, and up to how many times that it counts as such
 HEALTHY_RESIDUAL_RATIO = 2.0
-FROZEN_S = 1.0  # how long y or u stays exactly the same while the motion demands a change [s]
+FROZEN_S = 1.0  # how long y or u stays exactly the same while the motion demands a change [s],
+MIN_FROZEN_SAMPLES = 10  # or, where that is longer, so many samples: a loop of 0.1 Hz answers a step after one or two
 TRAVEL_SHARE = 0.1  # of the range of y, that r moves by then
 UNASKED_SHARE = 0.5  # of a motion, that r - y moves too where y does not follow r
 SILENCE_SHARE = 1e-6  # of the largest u: what a resampling filter leaves of 0
 JUMP_SHARE = 0.4  # of the range of y, in one sample: a counter that wraps or is reset
 MAX_JUMP_SHARE = 0.1  # share of the samples
 MIN_STEP_RATIO = 2.0  # times smaller are all other steps of y, and those of r at that time
-LEAD_SAMPLES = 3  # samples beyond the delay from u to y that r may step before y does
+LEAD_S = 0.2  # beyond the delay from u to y that r may step before y does: drives on a bus answer 0.06 s late [s],
+MIN_LEAD_SAMPLES = 3  # or, where that is longer, so many samples
 MAX_ROWS = 50_000  # that the residual is computed from
 BEGINNING_SHARE = 0.25  # of the rows in motion: what a log has wrong, a unit or a sign, it has wrong there too
 MIN_WRONG_SHARE, MAX_RIGHT_SHARE = (
@@ -78,15 +80,16 @@ def find_signal_defect(recording: Recording, delay_s: float = 0.0) -> SignalDefe
     `delay_s`: from u to y, by which a step of y that r asks for comes later.
     """
     span = float(np.ptp(outofcore.extremes(recording.y)))
-    settings = QualitySettings(frozen_s=FROZEN_S, frozen_travel=TRAVEL_SHARE * span or None)
-    limits, state = settings.limits(recording.sample_rate), init_state()
-    lead = LEAD_SAMPLES + round(delay_s * recording.sample_rate)
+    rate, frozen = recording.sample_rate, _frozen_samples(recording)
+    settings = QualitySettings(frozen_s=frozen / rate, frozen_travel=TRAVEL_SHARE * span or None)
+    limits, state = settings.limits(rate), init_state()
+    lead = max(MIN_LEAD_SAMPLES, round(LEAD_S * rate)) + round(delay_s * rate)
+    late = frozen + round(delay_s * rate)
     for chunk in outofcore.iter_chunks(0, recording.samples):
         rows = recording.rows(chunk)
         state, findings = check_block(limits, state, rows.t, rows.r, rows.u, rows.y)
-        candidates = [_frozen_defect(recording, finding) for finding in findings] + [
-            _find_jump(rows, chunk.start, lead)
-        ]
+        candidates = [_frozen_defect(recording, finding, late) for finding in findings]
+        candidates.append(_find_jump(rows, chunk.start, lead))
         outofcore.release(*recording.columns)
         if defects := [defect for defect in candidates if defect is not None]:
             return min(defects, key=lambda defect: defect.begin)
@@ -103,7 +106,7 @@ def find_switched_off(recording: Recording) -> SignalDefect | None:
         switches.append(rows.start + np.flatnonzero(np.diff(off, prepend=was_off)))
         was_off = bool(off[-1])
     edges = np.concatenate([*switches, np.full(int(was_off), recording.samples)]).reshape(-1, 2)
-    for begin, end in edges[np.diff(edges)[:, 0] > FROZEN_S * recording.sample_rate].tolist():
+    for begin, end in edges[np.diff(edges)[:, 0] > _frozen_samples(recording)].tolist():
         y, e = recording.y[begin:end], recording.r[begin:end] - recording.y[begin:end]
         moved = float(np.ptp(y))
         if moved > TRAVEL_SHARE * span and np.ptp(e) > UNASKED_SHARE * moved:
@@ -220,7 +223,11 @@ def _spread(x: FloatArray) -> float:
     return float(np.std(x))
 
 
-def _frozen_defect(recording: Recording, finding: QualityFinding) -> SignalDefect | None:
+def _frozen_samples(recording: Recording) -> int:
+    return max(MIN_FROZEN_SAMPLES, round(FROZEN_S * recording.sample_rate))
+
+
+def _frozen_defect(recording: Recording, finding: QualityFinding, late: int) -> SignalDefect | None:
     name = finding.kind.removeprefix("frozen_")
     if name == "u" and find_switched_off(recording) is not None:
         return None
@@ -234,15 +241,15 @@ def _frozen_defect(recording: Recording, finding: QualityFinding) -> SignalDefec
     low, high = outofcore.extremes(x)
     if name == "u" and not low < x[at] < high:
         return None  # it is limited
-    if name == "y" and _follows_late(recording, begin):
+    if name == "y" and _follows_late(recording, begin, late):
         return None
     other = "r" if name == "y" else "r - y"
     text = message("signals.frozen", name=name, t=float(recording.t[begin]), other=other, by=finding.value)
     return SignalDefect(begin, text)
 
 
-def _follows_late(recording: Recording, begin: int) -> bool:
-    """Return whether y, at rest from a sample on, moves within `FROZEN_S` of the motion of r that should move it.
+def _follows_late(recording: Recording, begin: int, late: int) -> bool:
+    """Return whether y, at rest from a sample on, moves within some samples of the motion of r that should move it.
 
     A rest before the command says nothing of the sensor, and a loop may take a while to break away.
     """
@@ -251,12 +258,11 @@ def _follows_late(recording: Recording, begin: int) -> bool:
     end = begin + int(moved[0]) if len(moved) else recording.samples
     r = recording.r[begin:end]
     demanded = np.maximum.accumulate(r) - np.minimum.accumulate(r) > travel
-    return bool(demanded.any()) and len(r) - int(np.argmax(demanded)) <= FROZEN_S * recording.sample_rate
+    return bool(demanded.any()) and len(r) - int(np.argmax(demanded)) <= late
 
 
 def _largest_near(steps: FloatArray, at: npt.NDArray[np.intp], lead: int) -> float:
-    near = np.clip(at[:, None] + np.arange(-lead, 2), 0, len(steps) - 1)
-    return float(steps[near].max())
+    return max(float(steps[max(k - lead, 0) : k + 2].max()) for k in at.tolist())
 
 
 def _find_jump(rows: Recording, first: int, lead: int) -> SignalDefect | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.history import history_folder, read_history, replace_baseline
@@ -102,17 +103,14 @@ def relearn(
         notes[point] = compare_with_earlier(earlier, point, some, progress, accept_change or after is not None)
         if reference is not earlier:
             compare_with_earlier(reference, point, some, progress, accept_change or after is not None, "first")
-    kept: dict[str, list[Recording]] = {}
     learned = {baseline.point: baseline for baseline in earlier.per_point if baseline.point in new}
+    together = {point: list(new[point]) for point in learned}
     for each in () if after in RENEWALS else learned.values():
-        kept[each.point], missing = find_sources(each, folders)
+        kept, missing = find_sources(each, folders)
         if missing and not leave_out:
-            raise BaselineError(
-                f"{path}: its recording {missing[0]} is not in {' or '.join(dict.fromkeys(map(str, folders)))}: put it "
-                "there, or learn from the new recordings alone (after a repair, for example)"
-            )
-        notes.setdefault(each.point, []).extend(message("learning.source_missing", recording=name) for name in missing)
-    together = {point: [*kept.get(point, ()), *new[point]] for point in learned}
+            _refuse_missing(path, missing[0], folders)
+        together[each.point][:0] = kept
+        notes[each.point] += [message("learning.source_missing", recording=name) for name in missing]
     chosen = together.get("", together)
     baseline = learn(loop, chosen, progress, accept_delay=accept_delay, force=force, earlier=earlier)
     number = max(history) + 1
@@ -127,14 +125,20 @@ def relearn(
         reference=number if changed or after in RENEWALS else known.reference,
     )
     for each in baseline.per_point:
-        before = learned[each.point]
-        update = {"notes": (*each.notes, *notes.get(each.point, ())), "learned": before.learned}
+        update = {"notes": (*each.notes, *notes.get(each.point, ())), "learned": learned[each.point].learned}
         learned[each.point] = each.model_copy(update=update)
     points = [learned.get(baseline.point, baseline) for baseline in earlier.per_point]
     baseline = points[0].model_copy(update={"others": tuple(points[1:]), "revision": revision})
     if save:
         replace_baseline(path, baseline)
     return baseline
+
+
+def _refuse_missing(path: Path, name: str, folders: Sequence[Path]) -> NoReturn:
+    raise BaselineError(
+        f"{path}: its recording {name} is not in {' or '.join(dict.fromkeys(map(str, folders)))}: put it there, or "
+        "learn from the new recordings alone (after a repair, for example)"
+    )
 
 
 def find_sources(baseline: Baseline, folders: Sequence[Path]) -> tuple[list[Recording], list[str]]:

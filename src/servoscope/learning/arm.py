@@ -31,6 +31,7 @@ from servoscope.detection.arm_evidence import (
 from servoscope.estimation.arm_regression import (
     MIN_MOVING_S,
     ArmSignals,
+    Information,
     block_information,
     filter_arm_log,
 )
@@ -59,6 +60,16 @@ class _Fit(NamedTuple):
     prior: FloatArray  # (P, P)
 
 
+class _Scatter(NamedTuple):
+    """How healthy recordings differ, in directions of change (D,)."""
+
+    inflation: FloatArray  # of the noise's variance: samples of a joint hang together, (n,)
+    information: list[Information]  # each recording's, of coefficients and of directions
+    scale: FloatArray  # size of each direction
+    between: FloatArray  # standard deviation between recordings
+    drift: FloatArray  # within one
+
+
 @with_one_blas_thread
 def learn_arm(loop: ArmLoop, urdf: str, recordings: Sequence[ArmRecording]) -> ArmBaseline:
     """Learn from healthy recordings; `urdf`: the text of the URDF.
@@ -69,9 +80,7 @@ def learn_arm(loop: ArmLoop, urdf: str, recordings: Sequence[ArmRecording]) -> A
     signals = [filter_arm_log(recording, model) for recording in recordings]
     _check_motion(model, signals)
     temperature = np.mean([signal.temperature.mean(0) for signal in signals], axis=0)
-    p = len(model.base.names)
-    theta = np.zeros(len(coefficient_names(model)))
-    theta[:p] = model.base.nominal
+    theta = _start(model)
     for _ in range(2):  # friction by load needs the load, which the first fit gives
         designs = [complete_columns(model, signal, theta, temperature) for signal in signals]
         fit = _fit(model, signals, designs)
@@ -79,58 +88,11 @@ def learn_arm(loop: ArmLoop, urdf: str, recordings: Sequence[ArmRecording]) -> A
     information = fit.A.sum(0) + fit.prior
     std = np.sqrt(np.diag(np.linalg.inv(information)))
     _check_signs(model, theta, std, recordings[0].name)
-
     torque = np.sqrt(np.mean([np.square(signal.tau).mean(1) for signal in signals], axis=0))
-    scale = deviation_scales(model, theta, torque)
-    # each recording by the coefficients of the others
-    several = len(signals) >= MIN_RECORDINGS
-    thetas = [
-        np.linalg.solve(information - fit.A[i], fit.b.sum(0) + fit.prior @ _start(model) - fit.b[i])
-        if several
-        else theta
-        for i in range(len(signals))
-    ]
-    residuals = [
-        signal.tau - np.einsum("jpm,p->jm", X, own) for signal, X, own in zip(signals, designs, thetas, strict=True)
-    ]
-    columns = [
-        np.concatenate([X, deviation_columns(model, signal, X, theta)], axis=1)
-        for signal, X in zip(signals, designs, strict=True)
-    ]
-    inflation = _inflation(signals, columns, residuals, fit.noise, len(theta))
-    weight = fit.noise * np.sqrt(inflation)
-    whole = [
-        block_information(signal.t, *weighted(signal, X, e, weight))
-        for signal, X, e in zip(signals, columns, residuals, strict=True)
-    ]
-    moves = slice(len(theta), None)
-    found = [(information.A.sum(0)[moves, moves], information.g.sum(0)[moves]) for information in whole]
-    between = random_effect(found, scale, BETWEEN_SHARE)
-    halves = [second_half(information.part(moves), np.diag(between**-2.0)) for information in whole]
-    drift = random_effect(halves, scale, DRIFT_SHARE)
-    information /= np.median(inflation)
-    notes = list(_mounting_notes(model, signals, designs, fit, recordings[0].name))
-    limits = []
-    for i, one in enumerate(whole):
-        others = random_effect(found[:i] + found[i + 1 :], scale, BETWEEN_SHARE) if several else between
-        prior = np.zeros((len(theta) + scale.size,) * 2)
-        prior[: len(theta), : len(theta)] = information - several * fit.A[i] / np.median(inflation)
-        prior[moves, moves] = np.diag(others**-2.0)
-        test = ChangeTest(one, prior, arm_causes(model), scale, drift)
-        if i == len(whole) // 2:
-            limits.append(test.healthy_limit(loop.false_alarms))
-        if several:
-            evidence = test.weigh()
-            limits.append(evidence.log_factor)
-            if evidence.log_factor > -float(np.log(loop.false_alarms)):
-                cause = evidence.causes[0].cause
-                text = {
-                    "kind": cause.kind,
-                    "joint": message("arm.of_joint", joint=cause.joint) if cause.joint else None,
-                }
-                notes.append(message("arm.odd_recording", name=recordings[i].name, **text))
-    if not several:
-        notes.append(message("arm.few_recordings", least=MIN_RECORDINGS))
+    residuals = _left_out_residuals(model, signals, designs, fit)
+    scatter = _learn_scatter(model, signals, designs, residuals, fit, deviation_scales(model, theta, torque))
+    typical = np.median(scatter.inflation)
+    limits, odd = _judge_each(model, recordings, fit, scatter)
     events = np.max(
         [
             largest_events(signal, X, e, fit.noise, model, theta)
@@ -138,30 +100,95 @@ def learn_arm(loop: ArmLoop, urdf: str, recordings: Sequence[ArmRecording]) -> A
         ],
         axis=0,
     )
+    least_event = np.maximum(MIN_EVENT_LIMIT, MIN_EVENT_SHARE * torque / fit.noise)
     return ArmBaseline(
         loop=loop.model_dump(mode="json", exclude_defaults=True) | {"kind": "arm"},
         urdf=urdf,
-        sources=tuple(
-            BaselineSource(name=recording.name, samples=recording.rows, duration_s=recording.duration_s)
-            for recording in recordings
-        ),
+        sources=tuple(BaselineSource(name=rec.name, samples=rec.rows, duration_s=rec.duration_s) for rec in recordings),
         names=coefficient_names(model),
         theta=to_tuples(theta),
-        information=to_tuples(information),
+        information=to_tuples(information / typical),
         temperature=to_tuples(temperature),
         noise=to_tuples(fit.noise),
-        inflation=to_tuples(inflation),
-        scale=to_tuples(scale),
-        between=to_tuples(between),
-        drift=to_tuples(drift),
+        inflation=to_tuples(scatter.inflation),
+        scale=to_tuples(scatter.scale),
+        between=to_tuples(scatter.between),
+        drift=to_tuples(scatter.drift),
         torque=to_tuples(torque),
-        event_limits=to_tuples(
-            np.maximum(np.maximum(EVENT_MARGIN * events, MIN_EVENT_LIMIT), MIN_EVENT_SHARE * torque / fit.noise)
-        ),
+        event_limits=to_tuples(np.maximum(EVENT_MARGIN * events, least_event)),
         limit=max(0.0, *limits),
-        undetermined=tuple(_undetermined(model, theta, std * np.sqrt(np.median(inflation)))),
-        notes=tuple(notes),
+        undetermined=tuple(_undetermined(model, theta, std * np.sqrt(typical))),
+        notes=(*_mounting_notes(model, signals, designs, fit, recordings[0].name), *odd),
     )
+
+
+def _left_out_residuals(
+    model: ArmModel, signals: Sequence[ArmSignals], designs: Sequence[FloatArray], fit: _Fit
+) -> list[FloatArray]:
+    """Return what each recording leaves of the torques, by the coefficients of the others where there are several."""
+    residuals = []
+    for signal, X, A, b in zip(signals, designs, fit.A, fit.b, strict=True):
+        theta = fit.theta
+        if len(signals) >= MIN_RECORDINGS:
+            theta = np.linalg.solve(fit.A.sum(0) + fit.prior - A, fit.b.sum(0) + fit.prior @ _start(model) - b)
+        residuals.append(signal.tau - np.einsum("jpm,p->jm", X, theta))
+    return residuals
+
+
+def _learn_scatter(
+    model: ArmModel,
+    signals: Sequence[ArmSignals],
+    designs: Sequence[FloatArray],
+    residuals: Sequence[FloatArray],
+    fit: _Fit,
+    scale: FloatArray,
+) -> _Scatter:
+    columns = [
+        np.concatenate([X, deviation_columns(model, signal, X, fit.theta)], axis=1)
+        for signal, X in zip(signals, designs, strict=True)
+    ]
+    inflation = _inflation(signals, columns, residuals, fit.noise, len(fit.theta))
+    weight = fit.noise * np.sqrt(inflation)
+    whole = [
+        block_information(signal.t, *weighted(signal, X, e, weight))
+        for signal, X, e in zip(signals, columns, residuals, strict=True)
+    ]
+    moves = slice(len(fit.theta), None)
+    between = random_effect([_change(one, moves) for one in whole], scale, BETWEEN_SHARE)
+    halves = [second_half(one.part(moves), np.diag(between**-2.0)) for one in whole]
+    return _Scatter(inflation, whole, scale, between, random_effect(halves, scale, DRIFT_SHARE))
+
+
+def _change(information: Information, moves: slice) -> tuple[FloatArray, FloatArray]:
+    """Return information and vector of a recording about the directions of change."""
+    return information.A.sum(0)[moves, moves], information.g.sum(0)[moves]
+
+
+def _judge_each(
+    model: ArmModel, recordings: Sequence[ArmRecording], fit: _Fit, scatter: _Scatter
+) -> tuple[list[float], list[Message]]:
+    """Return what the evidence for a change reaches in healthy recordings, each judged by the others, and notes."""
+    several = len(recordings) >= MIN_RECORDINGS
+    false_alarms, typical = model.loop.false_alarms, np.median(scatter.inflation)
+    moves, rest = slice(len(fit.theta), None), slice(len(fit.theta))
+    changes = [_change(one, moves) for one in scatter.information]
+    limits, notes = list[float](), list[Message]()
+    for i, one in enumerate(scatter.information):
+        others = random_effect(changes[:i] + changes[i + 1 :], scatter.scale, BETWEEN_SHARE)
+        prior = np.zeros((len(fit.theta) + scatter.scale.size,) * 2)
+        prior[rest, rest] = (fit.A.sum(0) + fit.prior) / typical - several * fit.A[i] / typical
+        prior[moves, moves] = np.diag((others if several else scatter.between) ** -2.0)
+        test = ChangeTest(one, prior, arm_causes(model), scatter.scale, scatter.drift)
+        if i == len(recordings) // 2:
+            limits.append(test.healthy_limit(false_alarms))
+        if several:
+            evidence = test.weigh()
+            limits.append(evidence.log_factor)
+            if evidence.log_factor > -float(np.log(false_alarms)):
+                cause = evidence.causes[0].cause
+                joint = message("arm.of_joint", joint=cause.joint) if cause.joint else None
+                notes.append(message("arm.odd_recording", name=recordings[i].name, kind=cause.kind, joint=joint))
+    return limits, notes if several else [message("arm.few_recordings", least=MIN_RECORDINGS)]
 
 
 def weighted(

@@ -134,6 +134,15 @@ def _learn_features(healthy: HealthyRecordings) -> tuple[FeatureModel | None, li
     return (None, []) if hidden else learn_features(healthy.loop, healthy.recordings)
 
 
+def _richer_baseline(earlier: Baseline | None, healthy: HealthyRecordings) -> Baseline | None:
+    """Return an earlier baseline that knows the scatter of more recordings than these; None where there is none."""
+    own = healthy.pipeline.bank.names
+    if earlier is not None and earlier.names != own:
+        names = ", ".join(earlier.names), ", ".join(own)
+        raise BaselineError(f"the earlier or like baseline has coefficients {names[0]}, this loop {names[1]}")
+    return earlier if earlier is not None and len(healthy.recordings) < earlier.scatter_from else None
+
+
 def _assemble_baseline(
     healthy: HealthyRecordings,
     plant: PlantKnowledge,
@@ -143,15 +152,11 @@ def _assemble_baseline(
 ) -> Baseline:
     loop, recordings, pipeline = healthy.loop, healthy.recordings, healthy.pipeline
     progress("rehearsal")
-    if earlier is not None and earlier.names != pipeline.bank.names:
-        names = ", ".join(earlier.names), ", ".join(pipeline.bank.names)
-        raise BaselineError(f"the earlier or like baseline has coefficients {names[0]}, this loop {names[1]}")
-    before = earlier if earlier is not None and len(recordings) < earlier.scatter_from else None
+    before = _richer_baseline(earlier, healthy)
     scatters = before is not None and not before.thresholds.hypotheses
     calibration, hypotheses, test_notes = learn_sequential_test(healthy, plant, scatters)
     axis, axis_notes = _learn_axis(healthy, before)
-    axis_scatter = None if axis is None else axis.scatter(pipeline.bank.names)
-    scatter = learn_scatter(healthy, plant, axis_scatter, before)
+    scatter = learn_scatter(healthy, plant, None if axis is None else axis.scatter(pipeline.bank.names), before)
     progress("features")
     features, feature_notes = _learn_features(healthy)
     if features is not None and before is not None:

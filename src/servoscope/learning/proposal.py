@@ -144,16 +144,7 @@ def propose_loop(paths: Sequence[Path], columns: Columns, where: Mapping[str, st
     path, others = paths[0], paths[1:]
     columns, wraps = _unwrapped_columns(path, columns, where)
     is_speed = names_speed(columns.outputs[0])
-    try:
-        recording = read(path, columns=columns, where=where)
-        inspection = _inspect(recording, is_speed)
-        irregular = inspection.sampling.jitter_percent > JITTER_PERCENT
-    except IrregularTimeError:
-        irregular = True
-    if irregular:
-        columns = columns.model_copy(update={"resample": True})
-        recording = read(path, columns=columns, where=where)
-        inspection = _inspect(recording, is_speed)
+    columns, recording, inspection = _read_evenly(path, columns, where, is_speed)
     if inspection.best_order is None or inspection.suggested_cutoff_hz is None:
         raise RecordingError(f"{path}: {inspection.summary}")
     rate = float(f"{recording.sample_rate:.6g}")
@@ -205,6 +196,22 @@ def propose_loop(paths: Sequence[Path], columns: Columns, where: Mapping[str, st
         *held,
     )
     return LoopProposal(loop, lines, candidates, (*notes, *told), path.name)
+
+
+def _read_evenly(
+    path: Path, columns: Columns, where: Mapping[str, str] | None, is_speed: bool
+) -> tuple[Columns, Recording, Inspection]:
+    """Return the first log and what `inspect` measures of it, resampled where its rows are not evenly spaced."""
+    try:
+        recording = read(path, columns=columns, where=where)
+        inspection = _inspect(recording, is_speed)
+        if inspection.sampling.jitter_percent <= JITTER_PERCENT:
+            return columns, recording, inspection
+    except IrregularTimeError:
+        pass
+    columns = columns.model_copy(update={"resample": True})
+    recording = read(path, columns=columns, where=where)
+    return columns, recording, _inspect(recording, is_speed)
 
 
 def _inspect(recording: Recording, is_speed: bool) -> Inspection:

@@ -57,7 +57,7 @@ class CauseWindow:
     def disturbances(self) -> dict[str, tuple[FloatArray, FloatArray]]:
         """What a unit of each adds to u and to y, shapes (N,)."""
         nothing, ones = np.zeros(self.window.samples), np.ones(self.window.samples)
-        moving = delayed(speed_sign(self.window.y), 1)
+        moving = delayed(speed_sign(self.window.y, self.window.sample_rate), 1)
         found = {
             "sensor_offset": (nothing, ones),
             "coulomb_friction": (-moving, nothing),

@@ -29,8 +29,9 @@ from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow, RefitWin
 from servoscope.models.plants import Fault
 from servoscope.signals import Recording
 
-BEFORE_S = 60.0  # of healthy motion before the onset
-AFTER_S = 240.0  # of motion with the change
+BEFORE_S = 60.0  # of healthy motion before the onset,
+AFTER_S = 240.0  # of motion with the change,
+MIN_BEFORE_SAMPLES, MIN_AFTER_SAMPLES = 600, 2400  # or so many samples of a loop slower than 10 Hz
 MAX_WINDOW_SAMPLES = 40_000  # samples in a window
 PAIR_PRIOR = 0.02  # probability that two faults come at once, before anything is known
 OUTSIDE_PRIOR = 0.01  # and that it is a parameter outside the list of faults
@@ -50,8 +51,8 @@ def onset_window(baseline: Baseline, recording: Recording, onset: int, last: int
     rate, most = recording.sample_rate, MAX_WINDOW_SAMPLES
     if baseline.axis is not None:
         most *= baseline.axis.stride
-    first = max(onset - min(round(BEFORE_S * rate), most // 4), 0)
-    end = min(last + 1, onset + round(AFTER_S * rate), first + most)
+    first = max(onset - min(max(round(BEFORE_S * rate), MIN_BEFORE_SAMPLES), most // 4), 0)
+    end = min(last + 1, onset + max(round(AFTER_S * rate), MIN_AFTER_SAMPLES), first + most)
     if baseline.axis is not None:
         return AxisWindow.from_recording(baseline, recording, first, end)
     return RefitWindow.from_recording(baseline, recording, first, end)

@@ -24,7 +24,8 @@ RUNGS = 33  # sizes of one fault that are looked at
 FURTHER_RANGE = (0.3, 3.0)  # ratios of a parameter outside the list of faults
 GRID = 17  # of each of two
 VALLEYS = 3  # from which searches begin
-BESIDE_S = 2.0, 10.0  # before and after the onset that the grid over two looks at
+BESIDE_S = 2.0, 10.0  # before and after the onset that the grid over two looks at,
+MIN_BESIDE_SAMPLES = 20, 100  # or so many samples of a loop slower than 10 Hz
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +79,8 @@ def pair_start_values(window: ChangeWindow, faults: Sequence[Fault], profile: Ch
     Only the seconds around the onset are looked at: far from the truth they say enough.
     """
     rate, step = window.sample_rate, profile.onset + profile.duration // 2
-    first, end = max(step - round(BESIDE_S[0] * rate), 0), step + round(BESIDE_S[1] * rate)
+    before, after = (max(round(s * rate), least) for s, least in zip(BESIDE_S, MIN_BESIDE_SAMPLES, strict=True))
+    first, end = max(step - before, 0), step + after
     near, names = window.cut(first, end), [fault.parameter for fault in faults]
     low, high = log_ratio_bounds(faults)
     axes = [np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True)]

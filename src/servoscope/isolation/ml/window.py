@@ -21,6 +21,7 @@ from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 
 MISSED_LAGS = 6  # samples of u and of y that a wrong dynamic model may have missed
+SIGN_S = 0.05  # over which the sign of a speed is taken [s]
 DRIFT_PIECES = 8  # of a drift, within which the predictor changes in straight lines
 COMPLEX_STEP = 1e-30  # complex step
 SENSOR_GAIN = "sensor_gain"
@@ -115,7 +116,7 @@ class ChangeWindow(abc.ABC):
         Missed dynamics: u and y of the last samples; backlash: the sign of y', added to y; Coulomb friction: the same,
         added to u; offsets of both.
         """
-        moving, ones = delayed(speed_sign(self.y), 1), np.ones(self.samples)
+        moving, ones = delayed(speed_sign(self.y, self.sample_rate), 1), np.ones(self.samples)
         lagged = [delayed(x, lag) for x in (self.u, self.y) for lag in range(1, MISSED_LAGS + 1)]
         return [*lagged, moving, ones], [moving, ones]
 
@@ -270,8 +271,9 @@ def delayed(x: FloatArray, samples: int) -> FloatArray:
     return np.concatenate([np.full(samples, x[0]), x[:-samples]])
 
 
-def speed_sign(y: FloatArray, over: int = 5) -> FloatArray:
-    """Return the sign of the difference over a few samples: noise does not decide it as long as there is motion."""
+def speed_sign(y: FloatArray, rate: float) -> FloatArray:
+    """Return the sign of the difference over `SIGN_S`: noise does not decide it as long as there is motion."""
+    over = max(1, round(SIGN_S * rate))
     return np.asarray(np.sign(np.concatenate([np.zeros(over), y[over:] - y[:-over]])))
 
 
