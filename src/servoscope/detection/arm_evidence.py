@@ -116,7 +116,8 @@ class ChangeTest:
     def _change_vector(self, g: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what vectors (S, K, P + D) say of a change from each onset on, (S, onsets, D).
 
-        And the logarithm of the Bayes factor of what changes within healthy recordings alone from there on, (S, onsets).
+        And the logarithm of the Bayes factor of what changes within healthy recordings alone, from each onset on,
+        (S, onsets): the reference that all onsets share.
         """
         first = g.shape[2] - self._drift.size
         late = g[:, ::-1, first:].cumsum(1)[:, ::-1][:, : len(self._gain)]
