@@ -1,4 +1,4 @@
-"""Logs of 1 GB through `init`, `learn` and `diagnose`: wall time, CPU time, and the largest resident size of each.
+"""Logs of 1 GB through `init`, `inspect`, `learn` and `diagnose`: times, and the largest resident size of each.
 
     python benchmarks/large_log.py [--json] [--rows N]
 
@@ -73,6 +73,7 @@ def main() -> None:
         size = (folder / "day.csv").stat().st_size
         steps = (
             ("init", "day.csv", "--yes"),
+            ("inspect", "day.csv", "--loop", "loop.toml"),
             ("learn", "loop.toml", "day.csv", "-o", "baseline.json"),
             ("diagnose", "baseline.json", "day.csv"),
             ("diagnose", "baseline.json", "leak.csv"),

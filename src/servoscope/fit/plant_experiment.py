@@ -161,6 +161,20 @@ class PlantExperiment:
         return float(nominal.get("offset", 0.0)) / self.plant.input_gain
 
 
+def initial_noise(loop: Loop, recordings: Sequence[Recording], noise: WhiteNoise | None) -> WhiteNoise | None:
+    """Return the noise that a search begins with; None where the exact predictor cannot be written down.
+
+    That is so where the noise is unknown, the plant is not linear, or the input is not held.
+    """
+    plant = loop.plant
+    if noise is None or not noise.y_std > 0.0 or loop.hold != "zoh":
+        return None
+    if not plant.has_physics or not plant.linear or plant.extras:
+        return None
+    least = MIN_NOISE_RATIO * float(np.mean([rec.u.std() for rec in recordings]))
+    return WhiteNoise(u_std=max(noise.u_std, least), y_std=noise.y_std)
+
+
 def robust_covariance(fitted: Fit) -> FloatArray:
     """Return the covariance of a fit with each standard deviation that of correlated innovations, where larger."""
     C, score = fitted.covariance, fitted.weight * fitted.jacobian * fitted.residual[:, None]

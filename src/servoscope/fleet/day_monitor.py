@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -34,16 +34,19 @@ _RowOrder = tuple[Rows, BoolArray]  # without repeated ones; which do not follow
 RowLookup = Callable[[int, int], Rows]  # rows of the day with after < t <= to, in order
 
 
-@dataclass(frozen=True, eq=False)
-class EvaluationBlock:
-    """The evaluations of a block: time [us], theta (K, n), T^2, its limit, level, whether one is above its limit."""
+class EvaluationBlock(NamedTuple):
+    """The evaluations of a block: time [us], theta (K, n), T^2, its limit, level."""
 
-    t_us: IntArray
+    time_us: IntArray
     theta: FloatArray
     statistic: FloatArray
     threshold: FloatArray
     level: FloatArray
-    exceeded: BoolArray
+
+    @classmethod
+    def concatenate(cls, blocks: Iterable[EvaluationBlock]) -> EvaluationBlock:
+        """Return the evaluations of several blocks, at least one, in their order."""
+        return cls(*map(np.concatenate, zip(*blocks, strict=True)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -147,7 +150,7 @@ class DayMonitor:
         exceeding = consecutive_exceedances(trace.exceeded, state.exceeding)
         alarms = np.flatnonzero(exceeding > self.monitor.pipeline.delays[0])
         limits = np.full(len(trace.t), self.baseline.thresholds.statistic)
-        block = EvaluationBlock(taken.t_us[sample], trace.theta, trace.statistic, limits, trace.level, trace.exceeded)
+        block = EvaluationBlock(taken.t_us[sample], trace.theta, trace.statistic, limits, trace.level)
         if not len(rows):
             return state, block
         peaks = np.maximum(trace.statistic / limits, trace.level)[trace.ready]
@@ -164,7 +167,7 @@ class DayMonitor:
             gaps=state.gaps + int(restart.sum()) - first,
             evaluations=state.evaluations + len(trace.t),
             peak=float(max(state.peak, peaks.max(initial=0.0))),
-            alarm_us=int(block.t_us[alarms[0]]) if state.alarm_us is None and alarms.size else state.alarm_us,
+            alarm_us=int(block.time_us[alarms[0]]) if state.alarm_us is None and alarms.size else state.alarm_us,
         )
         if new.result is None and new.alarm_us is not None and new.last_us is not None:
             end = int(self._schedule.end(new.alarm_us, new.first_us))

@@ -209,7 +209,7 @@ class StreamShard:
                     self._states[asset].error = error_text(found)
                     continue
                 self._states[asset].state, evaluations[asset] = found
-            if any(len(block.t_us) for block in evaluations.values()):
+            if any(len(block.time_us) for block in evaluations.values()):
                 yield self._trace_frame(evaluations)
         for asset in pending:
             state = self._states[asset]
@@ -229,23 +229,15 @@ class StreamShard:
         return monitor
 
     def _trace_frame(self, evaluations: Mapping[str, EvaluationBlock]) -> Any:
-        blocks, counts = list(evaluations.values()), [len(block.t_us) for block in evaluations.values()]
+        whole = EvaluationBlock.concatenate(evaluations.values())
+        counts = [len(block.time_us) for block in evaluations.values()]
         days = [day_name(self._states[asset].day or 0) for asset in evaluations]
-        columns = {
-            name: np.concatenate([getattr(block, field) for block in blocks])
-            for name, field in {
-                "time_us": "t_us",
-                **{name: name for name in ("statistic", "threshold", "level")},
-            }.items()
-        }
-        theta = [row for block in blocks for row in block.theta]
         assets = np.repeat(np.array(list(evaluations), dtype=object), counts)
         return output(
             ["trace"] * sum(counts),
             asset=assets,
             day=np.repeat(np.array(days, dtype=object), counts),
-            theta=theta,
-            **columns,
+            **{**whole._asdict(), "theta": list(whole.theta)},
         )
 
     def _close_day(self, asset: str, state: StreamState) -> Any:

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from servoscope.core.errors import NotEnoughError, ServoscopeError
 from servoscope.core.files import atomic_write, make_folder
 from servoscope.core.workers import Progress, WorkerError, Workers
@@ -209,11 +207,8 @@ def _encode_trace(trace: Sequence[EvaluationBlock]) -> bytes:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    theta = np.concatenate([block.theta for block in trace])
-    columns = {"time_us": np.concatenate([block.t_us for block in trace])}
-    columns |= {f"theta_{i}": theta[:, i] for i in range(theta.shape[1])}
-    for name in ("statistic", "threshold", "level"):
-        columns[name] = np.concatenate([getattr(block, name) for block in trace])
+    time_us, theta, *tests = EvaluationBlock.concatenate(trace)
+    names = ("time_us", *(f"theta_{i}" for i in range(theta.shape[1])), *EvaluationBlock._fields[2:])
     sink = io.BytesIO()
-    pq.write_table(pa.table(columns), sink)
+    pq.write_table(pa.table([time_us, *theta.T, *tests], names=list(names)), sink)
     return sink.getvalue()

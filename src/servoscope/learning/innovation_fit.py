@@ -15,7 +15,7 @@ import numpy as np
 from servoscope.baseline.plant_fit import PRIOR_STD
 from servoscope.core.arrays import FloatArray
 from servoscope.estimation.noise_model import WhiteNoise, largest_autocorrelation
-from servoscope.fit.plant_experiment import LAGS, MIN_NOISE_RATIO, PlantExperiment, robust_covariance
+from servoscope.fit.plant_experiment import LAGS, PlantExperiment, initial_noise, robust_covariance
 from servoscope.fit.search import fit
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
@@ -55,11 +55,9 @@ class InnovationFit:
 
 def fit_innovations(loop: Loop, recordings: Sequence[Recording], noise: WhiteNoise) -> InnovationFit | None:
     """Fit plant and noise to healthy recordings; None where the predictor cannot be written down."""
-    plant = loop.plant
-    if not noise.y_std > 0.0 or loop.hold != "zoh" or not plant.has_physics or not plant.linear or plant.extras:
+    plant, begin = loop.plant, initial_noise(loop, recordings, noise)
+    if begin is None:
         return None
-    u_std = max(noise.u_std, MIN_NOISE_RATIO * float(np.mean([rec.u.std() for rec in recordings])))
-    begin = WhiteNoise(u_std=u_std, y_std=noise.y_std)
     near = np.full(len(plant.parameters), PRIOR_STD)
     likely = _search(PlantExperiment.from_recordings(loop, recordings, plant, plant.parameters, near, begin))
     if likely is None or likely.is_likely(near, MIN_FILE_PROBABILITY):

@@ -27,7 +27,7 @@ def plot_inspection(inspection: Inspection, recording: Recording) -> Iterator[tu
     if traces is not None and traces.spectra is not None:
         yield "Spectra and coherence", _plot_spectra(inspection, traces)
     if traces is not None and traces.used.any():
-        yield "Residual", _plot_residual(traces, recording)
+        yield "Residual", _plot_residual(traces)
 
 
 def _two_rows(*, share_x: bool) -> tuple[Figure, Axes, Axes]:
@@ -82,7 +82,8 @@ def _plot_spectra(inspection: Inspection, traces: InspectionTraces) -> Figure:
 
 
 @plot_style()
-def _plot_residual(traces: InspectionTraces, recording: Recording) -> Figure:
+def _plot_residual(traces: InspectionTraces) -> Figure:
+    recording = traces.recording
     figure, top, bottom = _two_rows(share_x=False)
     unit, factor = time_axis_unit(recording.duration_s)
     v = np.where(traces.used, traces.v, np.nan)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from pydantic import BaseModel
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.history import history_folder, replace_baseline, step_back
@@ -31,7 +32,7 @@ MAX_OFFERED_RATIO = 0.95  # of a smallest detectable change, that is worth an of
 JUDGED_AGAIN_S = 28 * 86400.0  # of past values that a preview judges again [s]
 
 
-class LearningProgress(NamedTuple):
+class LearningProgress(BaseModel):
     """How far an asset is after what was announced: `after` and `since` of the note, None where there is none."""
 
     after: Occasion | None
@@ -57,11 +58,18 @@ def learning_progress(
     revision = baseline.revision
     notes = [note for note in read_notes(store, asset) if note.get("kind", NOTE) not in (NOTE, CONFIRMATION)]
     kept_s = config.diagnosis.kept_s
-    known = min(MIN_LEARN_S, kept_s), revision.number, revision.parent > 0
-    if not notes or notes[-1]["kind"] == BASELINE_NOTE:
-        return LearningProgress(None, None, 0.0, *known)
-    last = notes[-1]
-    return LearningProgress(last["kind"], last["t"], min(max(status.position.t - last["t"], 0.0), kept_s), *known)
+    after, since, learned_s = None, None, 0.0
+    if notes and notes[-1]["kind"] != BASELINE_NOTE:
+        after, since = notes[-1]["kind"], notes[-1]["t"]
+        learned_s = min(max(status.position.t - since, 0.0), kept_s)
+    return LearningProgress(
+        after=after,
+        since=since,
+        learned_s=learned_s,
+        needed_s=min(MIN_LEARN_S, kept_s),
+        revision=revision.number,
+        can_go_back=revision.parent > 0,
+    )
 
 
 def offers(baseline: Baseline, status: AssetStatus, kept_s: float) -> list[Message]:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import signal
 import threading
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Callable, Collection, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
-from http.client import HTTPException
+from http.client import HTTPConnection, HTTPException
 from json import loads
 from pathlib import Path
 
@@ -98,11 +97,9 @@ class _Follower:
     def ask(self, path: str) -> bytes:
         """Return its answer; raises OSError where it has none."""
         try:
-            try:
-                with urllib.request.urlopen(f"http://{self._address}{path}", timeout=ANSWER_S) as answer:
-                    return bytes(answer.read())
-            except urllib.error.HTTPError as error:  # it is not ready, and says why
-                return error.read()
+            with closing(HTTPConnection(self._address, timeout=ANSWER_S)) as connection:
+                connection.request("GET", path)
+                return connection.getresponse().read()
         except (ValueError, HTTPException) as error:  # it has not started yet, or ended while it answered
             raise OSError(f"no answer: {error}") from None
 

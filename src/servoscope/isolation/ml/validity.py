@@ -8,8 +8,8 @@ import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.records import ExactPredictorFit
-from servoscope.estimation.noise_model import LIKELIHOOD_DROP, WhiteNoise
-from servoscope.fit.plant_experiment import MAX_SAMPLES, MIN_NOISE_RATIO, PlantExperiment
+from servoscope.estimation.noise_model import LIKELIHOOD_DROP
+from servoscope.fit.plant_experiment import MAX_SAMPLES, PlantExperiment, initial_noise
 from servoscope.fit.search import fit
 from servoscope.isolation.ml.goodness_of_fit import misspecification_columns, score_test
 from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
@@ -22,16 +22,13 @@ BISECTIONS = 6
 def fit_exact_predictor(baseline: Baseline, recordings: Sequence[Recording]) -> ExactPredictorFit | None:
     """Return the noise that makes the innovations of healthy recordings likeliest, and what they leave unexplained.
 
-    None where the predictor cannot be written down: the noise is unknown, the plant is not linear, the input is not
-    held. n_u is the loudest that the innovations allow: their likelihood has fallen by exp(-`LIKELIHOOD_DROP`) there.
+    None where the predictor cannot be written down. n_u is the loudest that the innovations allow: their likelihood has
+    fallen by exp(-`LIKELIHOOD_DROP`) there.
     """
-    loop, noise = baseline.loop, baseline.healthy.noise
-    if noise is None or not noise.y_std > 0.0 or loop.monitor.model_error or loop.hold != "zoh":
+    loop = baseline.loop
+    begin = initial_noise(loop, recordings, baseline.healthy.noise)
+    if begin is None or loop.monitor.model_error:
         return None
-    if not loop.plant.has_physics or not loop.plant.linear or loop.plant.extras:
-        return None
-    u_std = max(noise.u_std, MIN_NOISE_RATIO * float(np.mean([rec.u.std() for rec in recordings])))
-    begin = WhiteNoise(u_std, noise.y_std)
     recorded = PlantExperiment.from_recordings(loop, recordings, baseline.plant, (), np.zeros(0), begin)
     likely = fit(recorded.search, recorded.start(), recorded.all_but_delay)
     if not np.isfinite(likely.cost) or recorded.is_silent(likely):

@@ -13,7 +13,7 @@ from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.core.messages import Message, MessageText, message
 from servoscope.core.short_repr import ShortRepr
 from servoscope.estimation.filter_bank import filter_cutoff
-from servoscope.learning.inspection import delay, excitation, model_order, signals, simulation_fit
+from servoscope.learning.inspection import delay, excitation, model_order, signals
 from servoscope.learning.inspection import residual as leftover
 from servoscope.learning.inspection.excitation import FrequencyExcitation, Spectra
 from servoscope.learning.inspection.model_order import RegressionFit, Regressors
@@ -36,14 +36,21 @@ from servoscope.models.lti import settling_samples
 from servoscope.signals import MIN_SAMPLES, Recording
 from servoscope.signals.readers import as_recording
 from servoscope.signals.readers.frames import Source
+from servoscope.signals.recording import thin_out
 
+MAX_ROWS = 250_000  # that are analysed: more take memory and time, and show little more
+MIN_STRETCH_ROWS = 30_000  # of which a longer recording's consist
 MIN_USED_SHARE = 0.1  # share of the samples that must be left when rest is left out
 
 
 @dataclass(frozen=True, eq=False)
 class InspectionTraces:
-    """What figures need and no summary holds: spectra, residual v (N,) where used, autocorrelation rho."""
+    """What figures need and no summary holds: spectra, residual v (N,) where used, autocorrelation rho.
 
+    `recording`: the N rows that were analysed.
+    """
+
+    recording: Recording
     spectra: Spectra | None
     v: FloatArray
     used: BoolArray
@@ -105,13 +112,15 @@ def inspect(recording: Recording | Source, loop: Loop | str | Path | None = None
     'usable'
     """
     loop = Loop.of(loop) if loop is not None else None
-    recording = as_recording(recording, loop)
+    whole = recording = as_recording(recording, loop)
+    if whole.samples > MAX_ROWS:
+        recording = thin_out(whole, MAX_ROWS, MIN_STRETCH_ROWS)
     quantisation = tuple(signals.quantisation(name, getattr(recording, name)) for name in ("r", "u", "y"))
     basics: dict[str, InspectionModel | Message | str | tuple[InspectionModel, ...] | None] = {
         "recording": recording.name,
         "loop": loop.name if loop is not None else None,
-        "sampling": signals.sampling(recording),
-        "defects": signals.defect_counts(recording),
+        "sampling": signals.sampling(whole),
+        "defects": signals.defect_counts(whole),
         "quantisation": quantisation,
     }
     constant = tuple(q.signal for q in quantisation if q.values < 2)
@@ -128,7 +137,7 @@ def _conclude(
 ) -> Inspection:
     if is_at_rest(m):  # what was measured around them is noise
         m = m.model_copy(update={"frequencies": (), "suggested_cutoff_hz": None})
-    findings = derive_findings(m, loop, constant)
+    findings = derive_findings(m, loop, constant, None if traces is None else traces.recording.samples)
     verdict = overall_verdict(findings)
     severity = {"not usable": "stop", "usable with care": "care", "usable": "none"}[verdict]
     reasons = [finding.message for finding in findings if finding.severity == severity]
@@ -159,7 +168,8 @@ def _measure_with_model(
     periods = recording.samples / period if period is not None else None
     m = m.model_copy(update={"periods": periods})
     judged = spectra if m.coherent else None
-    rate, traces = recording.sample_rate, InspectionTraces(spectra, np.zeros(0), np.zeros(0, dtype=bool), np.zeros(0))
+    nothing, rate = np.zeros(0), recording.sample_rate
+    traces = InspectionTraces(recording, spectra, nothing, nothing.astype(np.bool_), nothing)
     noise = signals.white_noise_std(recording.y, recording.restart, m.quantisation[2].step)
     band = excitation.usable_band(spectra) if spectra is not None else None
     suggested = _suggested_cutoff(spectra, band.high_hz if band else None, noise, rate)
@@ -206,10 +216,9 @@ def _measure_with_model(
             "fit": _summarise_fit(model, g, which, fit, ungated),
             "residual": residual,
             "delay": _check_delay(delay.estimate_delay(recording, g, which, fit, independent), recording, loop, g),
-            "free_run": simulation_fit.free_run(recording, g, which, fit),
         }
     )
-    return m, InspectionTraces(spectra, fit.v, used, rho)
+    return m, InspectionTraces(recording, spectra, fit.v, used, rho)
 
 
 def _check_delay(found: delay.Delay, recording: Recording, loop: Loop | None, g: Regressors) -> delay.Delay:

@@ -1,4 +1,4 @@
-"""How well an inverse model explains a recording: regression, order, free run, and what is left over."""
+"""How well an inverse model explains a recording: regression, and order."""
 
 from __future__ import annotations
 

@@ -45,10 +45,15 @@ def recommend(m: InspectionMeasurements, loop: Loop | None) -> tuple[Message, ..
 
 
 def derive_findings(
-    m: InspectionMeasurements, loop: Loop | None, constant: tuple[str, ...] = ()
+    m: InspectionMeasurements, loop: Loop | None, constant: tuple[str, ...] = (), analysed: int | None = None
 ) -> tuple[InspectionFinding, ...]:
-    """Turn measurements into findings, the worst first; `constant` are the signals that never change."""
+    """Turn measurements into findings, the worst first.
+
+    `constant` are the signals that never change, `analysed` rows were measured, None for all.
+    """
     rows = [*_signal_findings(m, loop, constant)]
+    if analysed is not None and analysed < m.sampling.samples:
+        rows.append(("long", "note", _inspection("few_rows", analysed=analysed, rows=m.sampling.samples)))
     if is_at_rest(m):
         # Of a machine that does not move, spectra and models say nothing.
         rows.append(("rest", "stop", _inspection("no_motion", share=m.rest.share if m.rest else None)))
@@ -246,8 +251,6 @@ def _model_findings(m: InspectionMeasurements, loop: Loop | None) -> Iterator[_F
             yield "delay", "care", _inspection("other_delay", **values)
         else:
             yield "delay", "note", _inspection("delay", delay=d.words)
-    if m.free_run is not None:
-        yield "free_run", "note", m.free_run.words
     if m.residual is not None:
         yield from _residual_findings(m.residual, m.fit)
 

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from servoscope.core import outofcore
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.messages import Message, message
 from servoscope.models.loop import Loop
@@ -95,17 +96,17 @@ class Rest(InspectionModel):
 
 def sampling(recording: Recording) -> Sampling:
     """Describe the time axis."""
-    rate, t = recording.sample_rate, recording.t
-    follows = ~recording.restart[1:]
-    steps = np.diff(t)[follows] * rate
-    starts = np.flatnonzero(recording.restart)
+    rate, t, restart = recording.sample_rate, recording.t, recording.restart
+    spread = outofcore.sample_chunks(t.size)
+    steps = np.concatenate([np.diff(t[rows])[~restart[rows][1:]] for rows in spread]) * rate
+    starts = outofcore.find_rows(lambda rows: restart[rows], restart)
     longest = int(np.diff(np.append(starts, t.size)).max()) if starts.size else t.size
     expected = max(round(recording.duration_s * rate), 1)
     return Sampling(
         sample_rate_hz=rate,
         samples=recording.samples,
         duration_s=recording.duration_s,
-        runs=int(np.unique(recording.run).size),
+        runs=int(np.unique(recording.run[np.append(0, starts)]).size),
         stretches=max(int(starts.size), 1),
         longest_stretch_s=longest / rate,
         jitter_percent=100.0 * float(np.std(steps)) if steps.size else 0.0,

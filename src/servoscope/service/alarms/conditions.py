@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 from servoscope.core.messages import message, render
-from servoscope.service.alarms.settings import AlarmDefinition
+from servoscope.service.alarms.settings import ABNORMAL_WORDS, AlarmDefinition, AlarmSource
 from servoscope.service.assets.reception import Reception
 from servoscope.signals import quality
 
 Condition = Literal["normal", "abnormal", "unknown"]
-MASKING_FINDINGS = ("waiting", "silent")  # findings of data quality behind which no other can be detected
+# words of a source that say that no other of its words can be known
+MASKING_WORDS = {"verdict": ("undetermined",), "quality": ("waiting", "silent")}
 
 
 @dataclass(frozen=True)
@@ -40,29 +41,28 @@ def evaluate_condition(definition: AlarmDefinition, abnormal: bool, snapshot: As
 
     What is not known is not normal: an alarm neither occurs nor clears for want of data.
     """
-    words = definition.abnormal_words
-    if definition.source == "verdict":
-        if snapshot.verdict in words:
+    source = definition.source
+    if source in ABNORMAL_WORDS:
+        words = observed_words(source, snapshot)
+        if words is not None and any(word in definition.abnormal_words for word in words):
             return "abnormal"
-        return "unknown" if snapshot.verdict == "undetermined" else "normal"
-    if definition.source == "quality":
-        if any(kind in words for kind in snapshot.quality):
-            return "abnormal"
-        return "unknown" if any(kind in MASKING_FINDINGS for kind in snapshot.quality) else "normal"
-    if definition.source == "reception":
-        if snapshot.reception is None or snapshot.reception.source_down:  # the source has an alarm of its own
-            return "unknown"
-        return "abnormal" if snapshot.reception.state in words else "normal"
-    if definition.source == "connection":
-        return "unknown" if snapshot.connection is None else "abnormal" if snapshot.connection else "normal"
-    if definition.source == "outlook":
-        return "unknown" if snapshot.outlook is None else "abnormal" if snapshot.outlook in words else "normal"
-    if definition.source == "control":
-        return "unknown" if snapshot.control is None else "abnormal" if snapshot.control in words else "normal"
-    value: float | None = getattr(snapshot, definition.source)
+        masks = MASKING_WORDS.get(source, ())
+        return "unknown" if words is None or any(word in masks for word in words) else "normal"
+    value: float | None = getattr(snapshot, source)
     if value is None or math.isnan(value):
         return "unknown"
     return "abnormal" if value >= definition.limit - definition.hysteresis * abnormal else "normal"
+
+
+def observed_words(source: AlarmSource, snapshot: AssetSnapshot) -> tuple[str, ...] | None:
+    """Return the words of a source that hold now; None: not known."""
+    reception, trouble = snapshot.reception, snapshot.connection
+    if source == "reception":  # a source that is down has an alarm of its own
+        return None if reception is None or reception.source_down else (reception.state,)
+    if source == "connection":
+        return None if trouble is None else ("trouble",) * bool(trouble)
+    value: tuple[str, ...] | str | None = getattr(snapshot, source)
+    return (value,) if isinstance(value, str) else value
 
 
 def describe_cause(definition: AlarmDefinition, snapshot: AssetSnapshot) -> str:

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.records import Occasion
 from servoscope.core.messages import message, render
+from servoscope.diagnosis.result import Verdict
 from servoscope.isolation.candidate import FaultEstimate
 from servoscope.service.alarms import (
     FAULT_ALARM,
@@ -87,17 +88,24 @@ class AssetMetadata(_StatusRecord):
     window_s: float | None = None  # what an examination covers
 
 
-class AssetStatus(EvaluationStatus):
-    """An asset as users see it, with its newest evaluation."""
+class AssetVerdict(_StatusRecord):
+    """What is said of an asset."""
 
-    verdict: Literal["healthy", "fault", "undetermined"]
+    verdict: Verdict
     summary: str
     since: float  # since when the verdict holds [UTC s]
     onset: float | None  # of the fault [UTC s]
-    faults: tuple[FaultEstimate, ...] = ()  # by the last full diagnosis
     examined: float | None  # when it was examined last [UTC s]
     ne107: Ne107
     reasons: tuple[str, ...]  # for the status after NE 107
+    sized: float | None = None  # when the size of the fault was found last [UTC s]; None: by the full diagnosis alone
+    learning: LearningStatus | None = None  # after a repair
+
+
+class AssetStatus(AssetVerdict, EvaluationStatus):
+    """An asset as users see it, with its newest evaluation."""
+
+    faults: tuple[FaultEstimate, ...] = ()  # by the last full diagnosis
     quality: dict[str, float]  # findings of data quality that hold now, and since when [UTC s]
     alarms: dict[str, AlarmStatus]  # those that are not normal
     pending_diagnoses: tuple[int, ...] = Field((), alias="awaited")  # numbers of their rows
@@ -105,10 +113,7 @@ class AssetStatus(EvaluationStatus):
     # when sound data last showed the fault, and the end of the window that named it [UTC s]
     fault_at: float | None = None
     diagnosed: float | None = None
-    # size, sized: of the fault by the newest examination, and when that was [UTC s]; None: by the full diagnosis alone
-    size: FaultEstimate | None = None
-    sized: float | None = None
-    learning: LearningStatus | None = None  # after a repair
+    size: FaultEstimate | None = None  # of the fault by the newest examination, at `sized`
     outlook: Outlook | None = None  # when the fault reaches its limit; None: it has none, or nothing is known yet
     position: StreamPosition = Field(alias="counted")
     metadata: AssetMetadata = Field(AssetMetadata(), alias="about")

@@ -48,21 +48,20 @@ class CommandOutcome(NamedTuple):
 
 def fault_rows(t: float, kind: str, faults: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return the rows of faults as a diagnosis names them, found at `t` [UTC s]."""
-    rows = []
-    for fault in faults:
-        low, high = fault["interval"]
-        values = {"value": fault["ratio"], "low": low, "high": high, "healthy": 1.0}
-        rows.append({"t": t, "kind": kind, "name": fault["name"], **values})
-    return rows
+    found = ((fault["name"], fault["ratio"], *fault["interval"], 1.0) for fault in faults)
+    return [_size_row(t, kind, *values) for values in found]
 
 
 def coefficient_rows(t: float, parameters: Iterable[tuple[str, float, float, float]]) -> list[dict[str, Any]]:
     """Return the rows of coefficients, each with name, value, standard deviation and healthy value, at `t` [UTC s]."""
-    rows = []
-    for name, value, std, healthy in parameters:
-        values = {"value": value, "low": value - NORMAL_95 * std, "high": value + NORMAL_95 * std, "healthy": healthy}
-        rows.append({"t": t, "kind": "coefficient", "name": name, **values})
-    return rows
+    return [
+        _size_row(t, "coefficient", name, value, value - NORMAL_95 * std, value + NORMAL_95 * std, healthy)
+        for name, value, std, healthy in parameters
+    ]
+
+
+def _size_row(t: float, *values: str | float) -> dict[str, Any]:
+    return {"t": t, **dict(zip(("kind", "name", "value", "low", "high", "healthy"), values, strict=True))}
 
 
 def period_number(t: float | None) -> int | None:

@@ -36,7 +36,7 @@ def _progress(context: Context, config: ServiceFile, asset: str, status: AssetSt
     progress = renewal.learning_progress(config, context.store, asset, status, baseline)
     point = config.assets[asset].point
     offers = renewal.offers(baseline.at(point) if point else baseline, status, config.diagnosis.kept_s)
-    return responses.RelearningState(**progress._asdict(), offers=offers)
+    return responses.RelearningState(**dict(progress), offers=offers)
 
 
 @router.get("/assets/{asset}/relearning")

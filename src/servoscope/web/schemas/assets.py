@@ -11,14 +11,13 @@ from typing import Any, get_args
 
 from pydantic import Field
 
-from servoscope.diagnosis.result import Verdict
 from servoscope.estimation.frequency_response import CHI2_95_2DOF, ResponseRow
 from servoscope.prognosis.series import NORMAL_95
 from servoscope.report.document import to_json
 from servoscope.service.alarms import PRIORITIES, TRANSITION_TABLE, LifecycleEvent, LifecycleState, Ne107
 from servoscope.service.alarms.records import UNACKNOWLEDGED_STATES
 from servoscope.service.assets.outlook import Outlook
-from servoscope.service.assets.status import AlarmStatus, AssetStatus, FloodCounts, LearningStatus, ServiceStatus
+from servoscope.service.assets.status import AlarmStatus, AssetStatus, AssetVerdict, FloodCounts, ServiceStatus
 from servoscope.web.asset_document import asset_document, status_headline
 from servoscope.web.schemas.checks import FaultCheck
 from servoscope.web.schemas.requests import CommandName
@@ -119,28 +118,19 @@ class OutlookRow(Outlook, ApiResponse):
     t: float = Field(exclude=True)
 
 
-class AssetRow(ApiResponse):
+class AssetRow(AssetVerdict, ApiResponse):
     """An asset in the list of the fleet."""
 
     asset: str
     group: str
     source: str
-    verdict: Verdict
-    summary: str
-    since: float
-    onset: float | None
-    examined: float | None
-    ne107: Ne107
-    reasons: tuple[str, ...]
     quality: list[str]
     statistic: float | None
     level: float | None
     deviation: float | None
     alarms: list[AlarmRow]
     sizes: list[FaultSize]
-    sized: float | None
     outlook: OutlookRow | None
-    learning: LearningStatus | None
     heard: bool
     t: float
     at: float

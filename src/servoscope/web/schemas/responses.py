@@ -8,10 +8,10 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from servoscope.baseline.records import Occasion
 from servoscope.core.messages import MessageField
 from servoscope.diagnosis.result import Verdict
 from servoscope.service.access import Role
+from servoscope.service.renewal import LearningProgress
 from servoscope.web.stored_diagnosis import stored_headline
 
 JsonObject = dict[str, Any]  # a document of another package, passed on as it is
@@ -246,15 +246,9 @@ class LearningRow(StorageRecord):
     uploads: list[str]
 
 
-class RelearningState(ApiResponse):
+class RelearningState(LearningProgress, ApiResponse):
     """How far an asset is in learning `after` what was noted at `since` [UTC s], and which baseline is in force."""
 
-    after: Occasion | None
-    since: float | None
-    learned_s: float
-    needed_s: float
-    revision: int
-    can_go_back: bool
     offers: list[MessageField]
 
 
