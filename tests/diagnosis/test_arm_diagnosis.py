@@ -231,9 +231,8 @@ def test_a_load_of_known_mass_gives_the_drive_gains(ur10e: tuple[ArmBaseline, Ca
         recording = record(name)
         return replace(recording, torque=recording.torque * ratio)
 
-    calibrated = learn_arm(
-        loop, baseline.urdf, [scaled(source.name.removesuffix(".parquet")) for source in baseline.sources]
-    )
+    names = [source.name.removesuffix(".parquet") for source in baseline.sources]
+    calibrated = learn_arm(loop, baseline.urdf, [scaled(name) for name in names])
     diagnosis = diagnose_arm(calibrated, scaled("identification_data__ur-20_02_19_15harm50secLoad"))
     assert diagnosis.verdict == "healthy" and not diagnosis.warnings
     (fault,) = diagnosis.faults

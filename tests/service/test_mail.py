@@ -21,9 +21,16 @@ from test_network import certificate
 from servoscope.service.actions import ActionSettings, OutboxEntry, deliver, diagnosis_entries, transition_entries
 from servoscope.service.actions import mail as mail_module
 from servoscope.service.actions.dispatcher import OutboxDispatcher
-from servoscope.service.alarms import AlarmTransition, LifecycleEvent, LifecycleState, initial_alarm_state
+from servoscope.service.alarms import (
+    AlarmSettings,
+    AlarmTransition,
+    LifecycleEvent,
+    LifecycleState,
+    initial_alarm_state,
+)
 from servoscope.service.asset_link import qr_code
 from servoscope.service.clock import SteadyClock
+from servoscope.service.notifications import Notifier
 from servoscope.service.store import Batch, Store
 
 NOW = 1.7e9
@@ -80,8 +87,9 @@ def test_a_mail_is_plain_text_with_a_link_and_its_qr_code_over_an_encrypted_conn
     encryption: str, serve: Callable[[str], tuple[MailServer, dict[str, Any]]]
 ) -> None:
     inbox, keys = serve(encryption)
-    settings = settings_of(**keys, address="https://hall.example/")
+    settings = settings_of(**keys)
     row = entry(settings)
+    row.event["link"] = "https://hall.example/assets/press%201"
     result = deliver(row, settings, NOW)
     assert result.delivered, result.detail
     (mail,) = inbox.mails
@@ -232,3 +240,18 @@ def test_settings_that_would_send_a_password_in_the_clear_or_to_nobody_are_refus
         with pytest.raises(ValidationError, match=words):
             settings_of(**keys)
     assert json.dumps(settings_of().email["shift"].model_dump(mode="json"))
+
+
+def test_each_outlet_with_the_address_of_the_pages_sends_a_link() -> None:
+    page = {"address": "https://hall.example/"}
+    sinks = {
+        "webhook": {"desk": {"url": "http://desk", **page}},
+        "mqtt": {"bus": {"broker": {"host": "bus"}, "topic": "alarms", **page}},
+        "command": {"bell": {"argv": ["ring", "{link}"], **page}, "horn": {"argv": ["true"]}},
+        "email": {"shift": {"host": "localhost", **MAIL, **page}},
+    }
+    notifier = Notifier("hall", AlarmSettings(), ActionSettings.model_validate(sinks))
+    for asset, link in (("press 1", "https://hall.example/assets/press%201"), ("hall", "https://hall.example/")):
+        rows = notifier.notify([replace(NEW, asset=asset)], {}, NOW)
+        links = {row.values["sink"]: row.values["event"].get("link") for row in rows}
+        assert links == {"desk": link, "bus": link, "bell": link, "horn": None, "shift": link}

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from servoscope.core.errors import MessageError
+from servoscope.core.errors import ConfigError, MessageError
 from servoscope.service.mqtt import payload
 from servoscope.service.mqtt.payload import decode_block, encode_binary, encode_json
 from servoscope.service.sources.block import Block
@@ -217,3 +217,9 @@ def test_covariates_that_an_asset_needs_are_asked_for() -> None:
     assert decode_block("press", plain, 1.5).completed_at == 1.5
     with pytest.raises(MessageError, match="expected oil"):
         decode_block("press", plain, covariates=("oil",))
+
+
+def test_without_the_reader_of_json_nothing_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(payload, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"pysimdjson is missing, pip install 'servoscope\[mqtt\]'"):
+        payload.BlockMessages("plant", {})

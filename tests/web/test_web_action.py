@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 from zoneinfo import ZoneInfo
 
@@ -77,3 +79,34 @@ def test_an_alarm_is_acknowledged_and_another_shelved(open_page: Open, base: str
     expect(other).to_contain_text("shelved until")
     steps = {(one["asset"], one["after"]): one["who"] for one in asked(base, "/alarms/history")["transitions"]}
     assert steps["press-1", "acknowledged"] == steps["rig-1", "shelved"] == "local"
+
+
+# what an asset and a diagnosis draw; of the asset some are empty until there is something to draw
+CHARTS = {
+    "/assets/press-1": (
+        "What has happened",
+        "Both tests over time",
+        "Reference, output and input",
+        "Magnitude and phase",
+    ),
+    "/diagnoses/": ("Mean input over position and speed",),
+}
+
+
+@pytest.mark.parametrize("path", CHARTS)
+def test_every_chart_is_saved_as_csv(open_page: Open, base: str, path: str, tmp_path: Path) -> None:
+    page = open_page(path if path != "/diagnoses/" else f"{path}{diagnosis_of(base, 'press-1')}")
+    page.get_by_text("For experts").click()
+    for label in CHARTS[path]:
+        expect(page.get_by_role("img", name=re.compile(f"^{label}")).first).to_be_visible()
+    charts = page.get_by_role("img").filter(visible=True).filter(has=page.locator("canvas"))
+    labels = [chart.get_attribute("aria-label") for chart in charts.all()]
+    assert len(labels) >= len(CHARTS[path])
+    for label in labels:
+        page.get_by_label(f"View and save: {label}").click()
+        with page.expect_download() as download:
+            page.get_by_role("button", name=f"Save the values: {label}").click()
+        download.value.save_as(tmp_path / "chart.csv")
+        with (tmp_path / "chart.csv").open(encoding="utf-8", newline="") as file:
+            head, *rows = csv.reader(file)
+        assert rows and {len(row) for row in rows} == {len(head)}, label

@@ -73,17 +73,17 @@ class ChangeTest:
 
     def weigh(self) -> ChangeEvidence:
         """Return the evidence of the recording itself."""
-        r = self._change_vector(self._information.g[None])
+        r, drifted = self._change_vector(self._information.g[None])
         found = []
         for cause, term, log_prior in zip(self._causes, self._terms, self._log_prior, strict=True):
             sizes = term.sizes(r)[0]
-            logs = term.log_factors(r)[0]
+            logs = term.log_factors(r)[0] + drifted[0]
             total = float(np.logaddexp.reduce(logs))
             onset = np.exp(logs - total)
             size = onset @ sizes
             off = sizes - size
             covariance = np.einsum("k,kij->ij", onset, term.covariance) + np.einsum("k,ki,kj->ij", onset, off, off)
-            log_factor = total - float(np.log(logs.size)) + float(log_prior)
+            log_factor = total - float(np.logaddexp.reduce(drifted[0])) + float(log_prior)
             found.append(CauseEvidence(cause, log_factor, onset, size, covariance))
         logs = np.array([evidence.log_factor for evidence in found])
         order = np.argsort(-logs)
@@ -107,18 +107,23 @@ class ChangeTest:
         drift = rng.normal(size=(SIMULATED_RECORDINGS, self._drift.size)) * self._drift
         late = np.arange(len(A)) >= onset[:, None]
         effect[:, :, len(root) - self._drift.size :] += late[..., None] * drift[:, None]
-        r = self._change_vector(g + np.einsum("kij,skj->ski", A, effect))
-        factors = (term.log_factors(r) for term in self._terms)
-        logs = np.array([np.logaddexp.reduce(factor, axis=1) - np.log(factor.shape[1]) for factor in factors])
+        r, drifted = self._change_vector(g + np.einsum("kij,skj->ski", A, effect))
+        logs = np.array([np.logaddexp.reduce(term.log_factors(r) + drifted, axis=1) for term in self._terms])
+        logs -= np.logaddexp.reduce(drifted, axis=1)
         total = np.logaddexp.reduce(logs + self._log_prior[:, None], axis=0)
         return float(np.quantile(total, 1.0 - share))
 
-    def _change_vector(self, g: FloatArray) -> FloatArray:
-        """Return what vectors (S, K, P + D) say of a change from each onset on, (S, onsets, D)."""
+    def _change_vector(self, g: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what vectors (S, K, P + D) say of a change from each onset on, (S, onsets, D).
+
+        And the logarithm of the Bayes factor of what changes within healthy recordings alone, from each onset on,
+        (S, onsets): the reference that all onsets share.
+        """
         first = g.shape[2] - self._drift.size
         late = g[:, ::-1, first:].cumsum(1)[:, ::-1][:, : len(self._gain)]
         r = late - np.einsum("kpd,sp->skd", self._gain, g.sum(1))
-        return np.asarray(np.einsum("kij,skj->ski", self._damping, r, optimize=True))
+        damped: FloatArray = np.asarray(np.einsum("kij,skj->ski", self._damping, r, optimize=True))
+        return damped, 0.5 * ((r * damped) @ self._drift**2 + np.linalg.slogdet(self._damping)[1])
 
 
 class _Term(NamedTuple):

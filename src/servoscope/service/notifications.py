@@ -28,6 +28,7 @@ from servoscope.service.alarms import (
     notify_transition,
     step_alarm,
 )
+from servoscope.service.asset_link import page_address
 from servoscope.service.assets.examination import StoredDiagnosis
 from servoscope.service.assets.records import StepResult, TableRow, audit_row, transition_row
 
@@ -210,4 +211,7 @@ class Notifier:
         """Return the row of an entry; the keys of two services on one store must differ."""
         key = actions.idempotency_key(self.name, one.key)
         event = {**one.event, "key": key, "service": self.name}
+        sink, asset = self._settings.sinks.get(one.sink), event.get("asset")
+        if sink is not None and sink.address is not None:  # alarms of the service itself have no page of their own
+            event["link"] = page_address(sink.address, asset if asset != self.name else None)
         return TableRow("outbox", {**one.to_dict(), "key": key, "event": event, "outcome": ""})

@@ -16,7 +16,7 @@ from typing import Any
 
 from servoscope.core.messages import message, render
 from servoscope.service.actions.settings import TEST_EVENT, EmailSettings
-from servoscope.service.asset_link import page_address, qr_code
+from servoscope.service.asset_link import qr_code
 
 HOUR_S = 3600.0
 PORTS = {"tls": 465, "starttls": 587, "none": 587}
@@ -121,9 +121,9 @@ def compose_mail(key: str, events: Sequence[dict[str, Any]], settings: EmailSett
     mail["From"], mail["To"], mail["Date"] = settings.sender, ", ".join(settings.to), formatdate()
     mail["Subject"] = " ".join(f"[{first.get('service', 'servoscope')}] {subject}".split())
     mail["Message-ID"], mail["Auto-Submitted"] = f"<{key}@servoscope>", "auto-generated"
-    mail.set_content("\n\n".join(_describe_event(event, settings.address) for event in events) + "\n")
-    if settings.address is not None and len(events) == 1:
-        code = qr_code(_event_address(first, settings.address), "png")
+    mail.set_content("\n\n".join(_describe_event(event) for event in events) + "\n")
+    if "link" in first and len(events) == 1:
+        code = qr_code(first["link"], "png")
         mail.add_attachment(code, maintype="image", subtype="png", filename="servoscope.png", disposition="inline")
     return mail
 
@@ -137,19 +137,11 @@ def _subject(event: dict[str, Any]) -> str:
     return render(message("service.mail.subject", **words, state=str(event["after"]).replace("_", " ")))
 
 
-def _describe_event(event: dict[str, Any], address: str | None) -> str:
+def _describe_event(event: dict[str, Any]) -> str:
     details = event.get("details", {})
     checks = details.get("checks")
     action = render(message("service.mail.checks", checks=checks)) if checks else details.get("operator_action")
     texts = (_subject(event), event.get("cause"), action, details.get("consequence"))
     lines = [str(text) for text in texts if text]
     lines.append(render(message("service.mail.time", t=event["time"])))
-    if address is not None:
-        lines.append(_event_address(event, address))
-    return "\n".join(lines)
-
-
-def _event_address(event: dict[str, Any], address: str) -> str:
-    asset = event.get("asset")
-    has_page = asset not in (None, event.get("service"))  # the service's own alarms have none
-    return page_address(address, str(asset) if has_page else None)
+    return "\n".join([*lines, *([event["link"]] if "link" in event else [])])

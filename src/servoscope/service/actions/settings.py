@@ -30,7 +30,7 @@ PositiveInt = Annotated[int, Field(strict=True, ge=1)]
 DIAGNOSIS_EVENT = "diagnosed"  # an event that is none of the life-cycle: the cause of an alarm is known
 TEST_EVENT = "test"  # another: somebody tries whether notifications arrive
 MAX_RATIO = 1e3  # ratio to healthy, or its inverse, beyond which a change is not left to a formula
-PLACEHOLDERS = ("key", "time", "asset", "alarm", "event", "after", "priority", "quantity", "value", "previous")
+PLACEHOLDERS = ("key", "time", "asset", "alarm", "event", "after", "priority", "link", "quantity", "value", "previous")
 
 
 SINKS = ("webhook", "command", "mqtt", "email")  # keys of the tables of those that are told
@@ -66,6 +66,7 @@ class SinkSettings(Settings):
         LifecycleState.LATCHED_UNACKNOWLEDGED,
     )
     timeout_s: Positive = 10.0  # how long one attempt may take [s]
+    address: Annotated[str, Field(strict=True, pattern=r"^https?://\S+$")] | None = None  # of the pages, for links
 
 
 class WebhookSettings(TlsSettings, SecretSettings, SinkSettings):
@@ -129,7 +130,6 @@ class EmailSettings(TlsSettings, SecretSettings, SinkSettings):
     user: NonEmptyStr | None = None  # who we are to it; None: it asks nobody
     sender: MailAddress
     to: Annotated[tuple[MailAddress, ...], Field(min_length=1)]
-    address: Annotated[str, Field(strict=True, pattern=r"^https?://\S+$")] | None = None  # of the pages, for links
     per_hour: PositiveInt = 20  # most mails within an hour; what is beyond waits, and comes as one
     states: tuple[LifecycleState, ...] | None = (LifecycleState.UNACKNOWLEDGED,)
 

@@ -24,12 +24,13 @@ import math
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
-from servoscope.core.errors import MessageError
+from servoscope.core.errors import ConfigError, MessageError
 from servoscope.service.mqtt.topics import data_topic, parse_asset
 from servoscope.service.sources.block import MAX_COUNT, MAX_TIME_S, Block
 from servoscope.service.sources.message import Content, Decoder, InboxMessage, SourceAsset
@@ -243,6 +244,8 @@ class BlockMessages(Decoder):
     """Decodes the blocks of some assets under the topics that begin with a prefix."""
 
     def __init__(self, prefix: str, assets: Mapping[str, SourceAsset]) -> None:
+        if find_spec("simdjson") is None:
+            raise ConfigError("pysimdjson is missing, pip install 'servoscope[mqtt]'")
         self._prefix, self._covariates = prefix, {name: asset.covariates for name, asset in assets.items()}
 
     def addresses(self, *, everyone: bool = False) -> list[str]:
