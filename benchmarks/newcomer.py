@@ -115,7 +115,7 @@ def judge(program: str, folder: Path, home: Path, suffix: str) -> tuple[str, flo
         ["diagnose", "baseline.json", f"suspect{suffix}"],
     )
     told = [run([program, *command], folder, home) for command in commands]
-    verdict = " ".join(told[-1][0].split("\n  what to check")[0].split("\n", 1)[1].split())
+    verdict = " ".join(told[-1][0].split("\n  What to check")[0].split("\n", 1)[1].split())
     return verdict, sum(seconds for _, seconds in told), len(commands)
 
 
