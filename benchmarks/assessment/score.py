@@ -173,7 +173,7 @@ def main() -> None:
     left_out = np.zeros((len(real.features), len(CAUSES)))
     for loop in sorted(set(real.loops.tolist())):
         of = real.loops == loop
-        left_out[of] = fit(training, real, servo, loop).probabilities(real.features[of])
+        left_out[of] = fit(training, real, servo, loop).probabilities(real.features[of], process=True)
     tables = (
         verdict_table(test, probabilities),
         calibration_table(test, probabilities),

@@ -16,7 +16,7 @@ from records import Records, measured, servos, simulated
 from scipy import optimize, special
 
 from servoscope.assessment import posterior
-from servoscope.assessment.posterior import CausePosterior, expand_features
+from servoscope.assessment.posterior import CausePosterior, StictionDiscriminant, expand_features
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tables import parse_with_data, parser
@@ -26,12 +26,18 @@ LOOP_WEIGHT = 8.0  # what one measured loop counts, in simulated ones; its logs 
 BACKLASH_WEIGHT = 0.5  # valves stick more often than they have play
 SERVO_WEIGHT = 20.0  # the same of all servo recordings in a folder
 PENALTY = 5e-4  # on squared weights, per record
+DISCRIMINANT_FEATURES = 6  # that tell stiction best in the measured loops, by rank
+DISCRIMINANT_SHRINKAGE = 0.3  # of the covariance towards its diagonal: 34 loops were measured
 
 Floats = npt.NDArray[np.float64]
 
 
 def fit_posterior(
-    names: tuple[str, ...], features: Floats, possible: npt.NDArray[np.bool_], weights: Floats, penalty: float
+    names: tuple[str, ...],
+    features: Floats,
+    possible: npt.NDArray[np.bool_],
+    weights: Floats,
+    discriminant: StictionDiscriminant,
 ) -> CausePosterior:
     """Fit to records of which the possible causes are known, (N, causes); weights: of each record, (N,).
 
@@ -41,7 +47,7 @@ def fit_posterior(
     rows = expand_features(features, mean, std)
     shape = rows.shape[1], possible.shape[1]
     excluded = np.where(possible, 0.0, -np.inf)
-    scale = penalty * weights.sum()
+    scale = PENALTY * weights.sum()
 
     def objective(flat: Floats) -> tuple[float, Floats]:
         w = flat.reshape(shape)
@@ -53,7 +59,23 @@ def fit_posterior(
         return float(weights @ (all_causes - known) + scale * np.square(w[:-1]).sum()), gradient.ravel()
 
     found = optimize.minimize(objective, np.zeros(shape).ravel(), jac=True, method="L-BFGS-B", options={"maxiter": 250})
-    return CausePosterior(names, mean, std, found.x.reshape(shape))
+    return CausePosterior(names, mean, std, found.x.reshape(shape), discriminant)
+
+
+def fit_discriminant(real: Records, left_out: str = "") -> StictionDiscriminant:
+    """Fit the discriminant of stiction to means over the logs of each measured loop, without one of them."""
+    names = [str(name) for name in np.unique(real.loops) if name != left_out]
+    means = np.array([real.features[real.loops == name].mean(axis=0) for name in names])
+    sticks = np.array([real.possible[real.loops == name][0, 0] for name in names])
+    above = np.sign(means[sticks][:, None, :] - means[~sticks][None]).mean(axis=(0, 1))
+    own = [i for i, name in enumerate(real.names) if ":" not in name]  # at the log's own time scale
+    best = sorted(own, key=lambda i: -abs(float(above[i])))[:DISCRIMINANT_FEATURES]
+    ill, well = means[sticks][:, best], means[~sticks][:, best]
+    covariance = np.cov(np.vstack([ill - ill.mean(axis=0), well - well.mean(axis=0)]).T)
+    covariance += DISCRIMINANT_SHRINKAGE * np.diag(np.diag(covariance))
+    centre = (ill.mean(axis=0) + well.mean(axis=0)) / 2.0
+    weights = np.linalg.solve(covariance, ill.mean(axis=0) - well.mean(axis=0))
+    return StictionDiscriminant(tuple(real.names[i] for i in best), centre, weights)
 
 
 def to_json(fitted: CausePosterior) -> str:
@@ -61,6 +83,8 @@ def to_json(fitted: CausePosterior) -> str:
     plain: dict[str, Any] = {"names": fitted.names}
     for name in ("mean", "std", "weights"):
         plain[name] = [float(f"{x:.6g}") for x in getattr(fitted, name).ravel()]
+    told = {name: [float(f"{x:.6g}") for x in getattr(fitted.discriminant, name)] for name in ("centre", "weights")}
+    plain["discriminant"] = {"names": fitted.discriminant.names, **told}
     return json.dumps(plain) + "\n"
 
 
@@ -79,7 +103,7 @@ def fit(training: Records, real: Records, servo: Records, left_out: str = "") ->
         possible.append(records.possible[kept])
         weights.append(np.array([share[str(loop)] for loop in records.loops[kept]]))
     stacked = np.vstack(features), np.vstack(possible), np.concatenate(weights)
-    return fit_posterior(training.names, *stacked, PENALTY)
+    return fit_posterior(training.names, *stacked, fit_discriminant(real, left_out))
 
 
 def main() -> None:

@@ -24,7 +24,8 @@ def oracle(rig: CylinderRig, truth: CylinderTruth, samples: slice) -> np.ndarray
 
     def slope(x: np.ndarray, law: np.ndarray, drive: float) -> list[float]:
         y, v, p_a, p_b, spool, spool_speed, z, p_s = x
-        p_0, g_out, g_back, overlap, zero, w, leakage, air, coulomb, viscous, mobility, force = law
+        p_0, g_out, g_back, overlap, zero, valve_hz, leakage, share, coulomb, viscous, mass, force = law
+        w, air, mobility = 2.0 * np.pi * valve_hz, share * 1e5 / 1.4, 1.0 / mass
         out, back = max(spool + zero - overlap, 0.0) * g_out, max(-spool - zero - overlap, 0.0) * g_back
         null = rig.null_opening * g_out
         q_a = (out + null) * flow(p_s - p_a) - (back + null) * flow(p_a - rig.tank)

@@ -172,7 +172,7 @@ def assess(log: Samples | Source, *, name: str | None = None, travel: tuple[floa
         signals = AssessedSignals(t, r, u, y, None)
     analysis = analyse(r, u, y)
     signals = AssessedSignals(t, r, u, y, analysis)
-    probabilities = load_posterior().of(analysis.features)
+    probabilities = load_posterior().of(analysis.features, rate)
     if r is not None and _follows_reference(analysis, r):
         probabilities |= dict.fromkeys(("oscillation from outside", "too tight"), 0.0)
         total = sum(probabilities.values())

@@ -32,6 +32,7 @@ from servoscope.design.result import (
 from servoscope.design.scenario import Scenario, require_exact_predictor, require_study
 from servoscope.detection.statistic import required_noncentrality
 from servoscope.estimation.noise_model import WhiteNoise
+from servoscope.isolation.ml.search import BEFORE_S
 from servoscope.learning.detectability import MIN_MEMORIES
 from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Loop
@@ -44,7 +45,6 @@ from servoscope.simulation import simulate
 from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD
 
 LEARNED_S = 60.0  # of a healthy recording that is simulated, at least
-BEFORE_S = 60.0  # of healthy motion before the onset
 SEED = 1
 
 Progress = Callable[[str], None]

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 REFERENCE_C = 45.0  # degC at which the rig's parameters hold
 SETTLING_S = 1.5  # for which the reference is held before the recording begins
-ATMOSPHERE_PA, POLYTROPIC = 1e5, 1.4
 
 
 @dataclass(frozen=True)
@@ -108,7 +107,7 @@ class CylinderTruth:
     spool: FloatArray  # share of its full stroke
     temperature: FloatArray  # degC
     states: FloatArray  # (N, 8): y, y', p_A, p_B, spool, spool', bristle, p_S
-    laws: FloatArray  # (N, 12): rows of `servoscope.simulation.cylinder_kernels.Law`
+    laws: FloatArray  # (N, 12): `PARAMETERS` with faults and temperature, in the units of the rig
     faults: tuple[FaultEvent, ...]
 
 
@@ -126,7 +125,7 @@ PARAMETERS = (
     "mass",
     "process_force",
 )
-"""Parameters of the rig that a fault may multiply, in the order of the rows of the kernel."""
+"""Parameters of the rig that a fault may multiply."""
 
 
 def cylinder_motion(kind: str, duration_s: float, sample_rate: float, seed: int = 0) -> FloatArray:
@@ -220,7 +219,7 @@ def simulate_cylinder(
     begin[[0, 2, 3, 4, 7]] = r[0], p_a, p_b, -rig.zero, rig.pump_pressure
     u, acting, y, states = np.empty(N), np.empty(N), np.empty(N), np.empty((N, STATES))
     numbers, names = tuple(map(float, vars(rig).values())), tuple(vars(rig))
-    run_cylinder(numbers, laws, whole, feed, noise, begin, u, acting, y, states, names=names)
+    run_cylinder(numbers, laws, whole, feed, noise, begin, u, acting, y, states, names=names, parameters=PARAMETERS)
     if not np.isfinite(states).all():
         raise SimulationError("cylinder rig: the integration left all bounds, raise substeps")
     used = slice(settling, None)
@@ -276,7 +275,4 @@ def _laws(
             raise SimulationError(f"fault {fault}: the cylinder rig has {', '.join(PARAMETERS)}")
         grown = np.clip((t - fault.at_s) / fault.ramp_s, 0.0, 1.0) if fault.ramp_s else (t >= fault.at_s) * 1.0
         values[fault.parameter] = values[fault.parameter] * fault.ratio ** np.where(t < 0.0, fault.at_s <= 0.0, grown)
-    values["valve_hz"] = 2.0 * np.pi * values["valve_hz"]
-    values["air"] = values["air"] * ATMOSPHERE_PA / POLYTROPIC
-    values["mass"] = 1.0 / values["mass"]
     return np.column_stack(list(values.values()))

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 from servoscope.core.jit import maximum, minimum, sqrt, where
 from servoscope.core.jit.array_function import ArrayFunction
@@ -16,24 +17,9 @@ TURBULENT_PA = 1e4  # pressure drop below which the flow through an edge becomes
 MIN_PRESSURE_PA = 1e4  # of a chamber: below it oil evaporates, and the bulk modulus is that of foam
 CONTACT_M = 0.005  # distance over which the process force rises after the contact
 
+ATMOSPHERE_PA, POLYTROPIC = 1e5, 1.4  # of the air in the oil
+
 STATES = 8
-
-
-class Law(NamedTuple):
-    """What may change with faults and temperature, one row per sample, in SI units."""
-
-    pump_pressure: Any
-    gain_extend: Any  # flow through an edge at full opening [m^3/(s sqrt(Pa))]
-    gain_retract: Any
-    overlap: Any  # share of the full stroke of the spool
-    zero: Any  # the same: where the spool is at u = 0
-    valve: Any  # natural frequency [rad/s]
-    leakage: Any
-    air: Any
-    friction: Any
-    viscous: Any
-    mobility: Any  # 1/mass
-    process_force: Any
 
 
 def flow(drop: Any) -> Any:
@@ -41,10 +27,10 @@ def flow(drop: Any) -> Any:
     return drop / sqrt(abs(drop) + TURBULENT_PA)
 
 
-def derivative(printer: Any, p: Any, law: Law, drive: Any, x: Sequence[Any]) -> list[Any]:
+def derivative(printer: Any, p: Any, law: Any, drive: Any, x: Sequence[Any]) -> list[Any]:
     """Return x' under a held drive, x = [y, y', p_A, p_B, spool, spool', bristle, p_S], of the rig p."""
     y, v, p_a, p_b, spool, spool_speed, z, p_s = x
-    at = spool + law.zero
+    at, valve = spool + law.zero, 2.0 * math.pi * law.valve_hz
     out = maximum(at - law.overlap, 0.0) * law.gain_extend
     back = maximum(-at - law.overlap, 0.0) * law.gain_retract
     null = p.null_opening * law.gain_extend
@@ -54,7 +40,7 @@ def derivative(printer: Any, p: Any, law: Law, drive: Any, x: Sequence[Any]) -> 
     stiffness = []
     for pressure in (p_a, p_b):
         low = maximum(pressure, MIN_PRESSURE_PA)
-        stiffness.append(p.bulk_modulus / (1.0 + p.bulk_modulus * law.air / (low * low)))
+        stiffness.append(p.bulk_modulus / (1.0 + p.bulk_modulus * (law.air * ATMOSPHERE_PA / POLYTROPIC) / (low * low)))
     volume_a = p.dead_volume + p.area_a * (0.5 * p.stroke + y)
     volume_b = p.dead_volume + p.area_b * (0.5 * p.stroke - y)
     coulomb = law.friction + p.seal * (p_a + p_b)
@@ -66,11 +52,11 @@ def derivative(printer: Any, p: Any, law: Law, drive: Any, x: Sequence[Any]) -> 
     force = p.area_a * p_a - p.area_b * p_b - friction - p.spring * y - p.weight - pressed
     return [
         v,
-        force * law.mobility,
+        force * (1.0 / law.mass),
         (into_a - from_a - p.area_a * v - leak) * stiffness[0] / volume_a,
         (into_b - from_b + p.area_b * v + leak) * stiffness[1] / volume_b,
         spool_speed,
-        law.valve * (law.valve * (drive - spool) - 2.0 * p.valve_damping * spool_speed),
+        valve * (valve * (drive - spool) - 2.0 * p.valve_damping * spool_speed),
         slip,
         ((law.pump_pressure - p_s) / p.supply_resistance - into_a - into_b) / p.supply_capacity,
     ]
@@ -79,9 +65,9 @@ def derivative(printer: Any, p: Any, law: Law, drive: Any, x: Sequence[Any]) -> 
 @ArrayFunction
 def run_cylinder(
     printer: Any, rig: Any, laws: Any, r: Any, feed: Any, n_y: Any, begin: Any, u: Any, acting: Any,
-    y: Any, truth: Any, *, names: tuple[str, ...],
+    y: Any, truth: Any, *, names: tuple[str, ...], parameters: tuple[str, ...],
 ) -> None:  # fmt: skip
-    """Run the closed loop; `laws` (N, 12) holds rows of `Law`, `begin` (STATES,) the state at the first sample.
+    """Run the closed loop; `laws` (N, 12) holds rows of `parameters`, `begin` (STATES,) the state at the first sample.
 
     `rig` holds the numbers of a `CylinderRig`, which are called `names`; `feed` (N,) is the feed-forward of u. Writes u
     as logged, the spool's command from each sample to the next, y as measured, each (N,), and the states (N, STATES).
@@ -95,7 +81,7 @@ def run_cylinder(
         x[i] = begin[i]
     h = T / p.substeps
     for k in printer.loop(0, r.shape[0]):
-        law = Law(*(laws[k, i] for i in range(len(Law._fields))))
+        law = SimpleNamespace(**{name: laws[k, i] for i, name in enumerate(parameters)})
         for i in range(STATES):
             truth[k, i] = x[i]
         y[k] = resolution * ((x[0] + n_y[k]) / resolution).call("rint")
