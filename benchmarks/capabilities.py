@@ -237,8 +237,10 @@ def followed(monitor: ss.Monitor, case: Case, fleet: bool) -> dict[str, bool]:
     traces = {}
     for name in ("healthy", "fault", "ripple", *(["far"] if MOTION in case.learned else [])):
         one = case.recordings[name]
-        signals = [np.tile(x, (2, 1)) if fleet else x for x in (one.r, one.u, one.y, one.restart)]
-        _, trace = monitor.run(monitor.init(), *signals, channels={} if fleet else one.channels)
+        assets = (2, 1) if fleet else 1
+        signals = [np.tile(x, assets) for x in (one.r, one.u, one.y, one.restart)]
+        channels = {name: np.tile(x, assets) for name, x in one.channels.items()}
+        _, trace = monitor.run(monitor.init(), *signals, channels=channels)
         traces[name] = trace.lane(0) if fleet else trace
     quiet = not traces["healthy"].exceeded.any()
     features, far = traces["ripple"].features, traces.get("far")
@@ -260,15 +262,9 @@ def in_monitor(case: Case) -> Outcome:
 
 
 def in_fleet(case: Case) -> Outcome:
-    """Follow each recording with a monitor of two assets; without what it refuses."""
-    reasons, baseline = dict.fromkeys((REFIT, TIMELINE), ALARM_ONLY), case.one
-    if MOTION in case.learned:
-        plain = baseline.at({"load": LOAD}) if COVARIATES in case.learned else baseline
-        reasons[MOTION] = refusal(lambda: ss.Monitor([plain, plain], motion_check=True))
-    if COVARIATES in case.learned:
-        reasons[COVARIATES] = refusal(lambda: ss.Monitor([baseline, baseline]))
-        baseline = baseline.at({"load": LOAD})
-    return outcome("fleet", followed(ss.Monitor([baseline, baseline]), case, fleet=True), reasons)
+    """Follow each recording with a monitor of two assets."""
+    works = followed(ss.Monitor([case.one, case.one], motion_check=MOTION in case.learned), case, fleet=True)
+    return outcome("fleet", works, dict.fromkeys((REFIT, TIMELINE), ALARM_ONLY))
 
 
 def refusal(make: Callable[[], object]) -> str:

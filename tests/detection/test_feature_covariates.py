@@ -10,6 +10,7 @@ import pytest
 from axis_logs import LOOP, axis
 
 import servoscope as ss
+from servoscope.core.errors import RecordingError
 from servoscope.diagnosis.feature_evidence import FeatureEvidence
 from servoscope.learning.features import learn_features
 
@@ -58,6 +59,29 @@ class TestCovariates:
             parts.append(part.features)
         assert trace.features is not None and trace.features.max() > 0.0
         assert np.array_equal(state, end) and np.array_equal(np.concatenate(parts), trace.features)
+
+    def test_each_asset_of_a_fleet_has_its_own_oil(self, warm: ss.Baseline) -> None:
+        """To the bits that each has alone, wherever the block is cut; one without covariates among them."""
+        recordings = [warm_axis(72, 23.0), warm_axis(73, 28.0), warm_axis(74, 26.0, level=0.1)]
+        kinds = [warm, warm.at({"oil": 28.0}), warm]
+        fleet, parts = ss.Monitor(kinds), []
+        signals = [np.stack([getattr(one, name) for one in recordings]) for name in ("r", "u", "y")]
+        oil = np.stack([one.channels["oil"] for one in recordings])
+        state = fleet.init()
+        for a, b in pairwise([0, 1, 777, recordings[0].samples]):
+            state, trace = fleet.run(state, *(x[:, a:b] for x in signals), channels={"oil": oil[:, a:b]})
+            parts.append(trace)
+        latest = fleet.latest(state)
+        for asset, (one, kind) in enumerate(zip(recordings, kinds, strict=True)):
+            monitor = ss.Monitor(kind)
+            end, alone = monitor.run(monitor.init(), one.r, one.u, one.y, channels=one.channels)
+            for name in ("theta", "expected", "statistic", "ready", "features"):
+                together = np.concatenate([getattr(part.lane(asset), name) for part in parts])
+                assert np.array_equal(together, getattr(alone, name)), name
+            assert np.array_equal(state[asset][: end.size], end)
+            assert latest.lane(asset).statistic[0] == alone.statistic[-1]
+        with pytest.raises(RecordingError, match="oil"):
+            fleet.run(fleet.init(), *signals)
 
     def test_a_monitor_at_one_temperature_asks_for_no_column(self, warm: ss.Baseline) -> None:
         monitor, rec = ss.Monitor(warm.at({"oil": 23.0})), warm_axis(71, 23.0, seconds=150.0)

@@ -20,6 +20,7 @@ from servoscope.baseline.feature_model import (
     FeatureModel,
     FeatureName,
     GroupStatistic,
+    robust_limit,
     score_limit,
     spans_in_a_row,
 )
@@ -139,9 +140,17 @@ class TestWindows:
 
 class TestLimits:
     def test_the_limit_is_a_log_normal_prediction(self) -> None:
-        # logs 0, 1, 2: mean 1, variance 1; with 8 degrees of 0.25: (2 + 2)/10; t_10(0.995) = 3.169273 (tables)
-        expected = np.exp(1.0 + 3.169273 * np.sqrt(0.4 * (1.0 + 1.0 / 3.0)))
+        # logs 0, 1, 2: mean 1, deviations clipped to 1.345 x 0.45; with 20 degrees of 0.45^2; t_22(0.995) = 2.818756
+        variance = (1.41 * 2.0 * (1.345 * 0.45) ** 2 + 20.0 * 0.45**2) / 22.0
+        expected = np.exp(1.0 + 2.818756 * np.sqrt(variance * (1.0 + 1.0 / 3.0)))
         assert score_limit(np.exp([0.0, 1.0, 2.0]), 0.005) == pytest.approx(expected, rel=1e-6)
+
+    def test_one_outlier_raises_the_limit_to_its_own_score_and_no_further(self) -> None:
+        scores = np.exp(0.4 * np.random.default_rng(2).standard_normal(9))
+        alone, beside = score_limit(scores, 0.005), score_limit([*scores, 20.0], 0.005)
+        assert robust_limit([*scores, 20.0], 0.005) < 1.5 * alone and beside == 20.0
+        # more recordings like these lower the limit, or leave it about where it was
+        assert score_limit([*scores, *scores], 0.005) < alone
 
     def test_spans_in_a_row_keep_the_budget(self) -> None:
         for budget in (0.01, 1.0, 100.0):
@@ -225,6 +234,12 @@ class TestLearning:
         model, notes = learn_features(LOOP, [axis(seed, seconds=3.0) for seed in range(5)])
         assert model is None or model.layout.span_s <= 3.0, notes
 
+    def test_an_outlier_is_named_and_a_second_population_is_not(self) -> None:
+        alike = [axis(seed) for seed in range(9)]
+        for changed, named in (([axis(20, level=0.2)], 1), ([axis(20 + k, level=0.2) for k in range(5)], 0)):
+            _, notes = learn_features(LOOP, [*alike[len(changed) :], *changed])
+            assert sum(note.key == "learning.features_outlier" for note in notes) == named
+
     def test_a_file_keeps_them_and_a_shared_budget_waits_longer(self, baseline: ss.Baseline, tmp_path: Path) -> None:
         baseline.save(tmp_path / "baseline.json")
         assert ss.Baseline.load(tmp_path / "baseline.json") == baseline
@@ -232,7 +247,7 @@ class TestLearning:
         assert model is not None and shared is not None
         assert shared.in_a_row > model.in_a_row and shared.limit == model.limit
         assert len(baseline.scatter.left_out) == len(model.left_out) == 6
-        assert max(model.left_out) < model.limit and max(baseline.scatter.left_out) < 1.0
+        assert max(model.left_out) <= model.limit and max(baseline.scatter.left_out) < 1.0
 
 
 class TestVerdicts:

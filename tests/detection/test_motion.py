@@ -256,8 +256,22 @@ class TestMonitorWithMotionCheck:
         assert np.array_equal(state, end)
         assert np.array_equal(found, whole.motion)
 
+    def test_the_assets_of_a_fleet_are_checked_one_by_one(self) -> None:
+        """Each has what its own monitor says; T^2 to the bits, under the same motion and another one."""
+        recordings = [under(words)[:6_000] for words in ("as learned", "random, u at its limits")]
+        fleet = ss.Monitor([belt(), belt()], motion_check=True)
+        signals = [np.stack([getattr(one, name) for one in recordings]) for name in ("r", "u", "y", "restart")]
+        state, first = fleet.run(fleet.init(), *(x[:, :2_501] for x in signals))
+        state, rest = fleet.run(state, *(x[:, 2_501:] for x in signals))
+        latest = fleet.latest(state)
+        for asset, one in enumerate(recordings):
+            watched = ss.Monitor(belt(), motion_check=True)
+            end, trace = watched.run(watched.init(), one.r, one.u, one.y, one.restart)
+            for name in ("motion", "statistic"):
+                together = np.concatenate([getattr(part.lane(asset), name) for part in (first, rest)])
+                assert np.array_equal(together, getattr(trace, name))
+                assert np.array_equal(getattr(latest.lane(asset), name), getattr(watched.latest(end), name))
+
     def test_refusals(self) -> None:
-        with pytest.raises(BaselineError, match="the motion of a fleet is not checked"):
-            ss.Monitor([belt(), belt()], motion_check=True)
         with pytest.raises(BaselineError, match="learn it again"):
             ss.Monitor(belt().model_copy(update={"motion": None}), motion_check=True)

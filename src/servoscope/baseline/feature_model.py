@@ -8,8 +8,10 @@ the covariance of windows within recordings (oracle approximating shrinkage; Che
     S = ((n - p) S_m + nu k S_w)/(n - p + nu),  k = tr S_m/tr S_w
     C = S (1 + x' (X'X)^-1 x) + (n b)(n b)' + S_w max(1/m - 1/m_n, 0)
 
-which predicts a recording n places after the middle of those learned, b the slope over the order. The statistic is the
-largest T^2/d over groups of features that belong together.
+which predicts a recording n places after the middle of those learned, b the slope over the order. T^2/d of groups of
+features that belong together are averaged in the fourth power: one group that is far off counts, and so do several that
+are off together. The limit follows from the scores of recordings left out, whose mean and scatter are robust (Huber,
+1964), and is none below the largest of these: an outlier among them raises it to its own score, not to a multiple.
 
 A recording is compared with its own past too: the means of its later windows less those of its earlier ones, beside
 those differences in healthy recordings. What differs from day to day hides nothing then.
@@ -29,9 +31,14 @@ from servoscope.baseline.threshold import FEATURE_SHARE, SECONDS_PER_YEAR
 from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.estimation.window_features import MOTIONS, SIGNALS, FeatureLayout, Window
 
-PRIOR_DEGREES = 12.0  # degrees of freedom of the shape of S_w behind S
-SCORE_STD = 0.5  # of the logarithm of healthy scores, expected before any was seen
-SCORE_PRIOR = 8.0  # degrees of freedom of that expectation
+PRIOR_DEGREES = 30.0  # degrees of freedom of the shape of S_w behind S
+SCORE_STD = 0.45  # of the logarithm of healthy scores, expected before any was seen: that of F with 12 and 30 degrees
+SCORE_PRIOR = 20.0  # degrees of freedom of that expectation
+SCORE_POWER = 4.0  # in which the scores of groups are averaged
+MAX_SCORE_STDS = 1.345  # expected deviations of a logarithm from their mean; beyond, it counts as that (Huber, 1964)
+SCORE_CONSISTENCY = 1.41  # 1 over the share of a normal variance that this leaves
+MIN_SCORE = 1e-9  # of which a logarithm is taken
+HUBER_ROUNDS = 30  # after which the mean does not move any more
 # of the learned range, by which a covariate may be outside of it: the limit widens with the distance
 MAX_EXTRAPOLATION_SHARE = 0.2
 WIDENING_SHARE = 0.5  # share by which the healthy range of motion is widened either way
@@ -134,14 +141,16 @@ class FeatureModel(_FeatureRecord):
         return tuple(GroupStatistic.of(group) for group in self.groups)
 
     def ratio(self, span: SpanFeatures) -> float:
-        """Return the largest score over its limit; NaN where healthy recordings do not move like this."""
-        return max(self.ratios(span)) if self.is_familiar(span) else float("nan")
+        """Return the larger score over its limit; NaN where healthy recordings do not move like this."""
+        if not self.is_familiar(span):
+            return float("nan")
+        now, past = span_scores(self.statistics, span)
+        return max(now / self.limit, past / self.past_limit if self.compares_past else 0.0)
 
     def ratios(self, span: SpanFeatures) -> list[float]:
-        """Return T^2/d of each group over its limit."""
+        """Return T^2/d of each group over its limit; where the score exceeds it, the largest of them does."""
         return [
-            statistic.score(*statistic.group.pick(span), span.covariates)
-            / (self.past_limit if statistic.group.past else self.limit)
+            statistic.of_span(span) / (self.past_limit if statistic.group.past else self.limit)
             for statistic in self.statistics
         ]
 
@@ -238,6 +247,10 @@ class GroupStatistic(NamedTuple):
         spread = self.scale * np.sqrt(np.diag(self.predicted(covariates)))
         return np.asarray((values - self.expected(covariates)) / spread)
 
+    def of_span(self, span: SpanFeatures) -> float:
+        """Return T^2/d of the group's features in a span."""
+        return self.score(*self.group.pick(span), span.covariates)
+
     def score(self, values: FloatArray, windows: float, covariates: FloatArray = NO_COVARIATES) -> float:
         """Return T^2/d of features (k,) that are the mean of some windows; 0 where none of them was seen."""
         z = (values - self.expected(covariates)) / self.scale
@@ -253,6 +266,17 @@ def is_near(learned: FloatArray, covariates: FloatArray) -> bool:
     low, high = learned.min(axis=0), learned.max(axis=0)
     edge = MAX_EXTRAPOLATION_SHARE * (high - low)
     return bool(((covariates >= low - edge) & (covariates <= high + edge)).all())
+
+
+def span_scores(statistics: Sequence[GroupStatistic], span: SpanFeatures) -> tuple[float, float]:
+    """Return the score of a span against healthy recordings, and of its later windows against its earlier ones."""
+    scores = np.array([statistic.of_span(span) for statistic in statistics])
+    past = np.array([statistic.group.past for statistic in statistics], dtype=np.bool_)
+    now, later = (
+        float(np.mean(part[part > 0.0] ** SCORE_POWER)) ** (1.0 / SCORE_POWER) if (part > 0.0).any() else 0.0
+        for part in (scores[~past], scores[past])
+    )
+    return now, later
 
 
 def shrink(S: FloatArray, degrees: int) -> FloatArray:
@@ -317,24 +341,35 @@ def _own_past(group: FeatureGroup, spans: Sequence[Sequence[SpanFeatures]]) -> F
 def score_limit(left_out: Sequence[float], false_alarms: float) -> float:
     """Return the score that a further healthy recording exceeds with a probability, by a log-normal distribution.
 
-    Student's t for one more value beyond n, whose variance is shrunk to what is expected of such scores.
+    Student's t for one more value beyond n, whose variance is shrunk to what is expected of such scores. A larger score
+    among those left out is the limit instead.
     """
+    return max(robust_limit(left_out, false_alarms), *left_out)
+
+
+def robust_limit(left_out: Sequence[float], false_alarms: float) -> float:
+    """Return what `score_limit` does, without the largest score: one that exceeds it is an outlier."""
     from scipy import special
 
     quantile = float(special.stdtrit(len(left_out) - 1.0 + SCORE_PRIOR, 1.0 - false_alarms))
-    return float(np.exp(_score_logs(left_out).mean() + quantile * score_std(left_out)))
+    return float(np.exp(_score_mean(left_out)[0] + quantile * score_std(left_out)))
 
 
 def score_std(left_out: Sequence[float]) -> float:
     """Return the standard deviation of the logarithm of a further healthy recording's score around their mean."""
-    logs, n = _score_logs(left_out), len(left_out)
-    own = float(logs.var(ddof=1)) if n > 1 else 0.0
-    variance = ((n - 1.0) * own + SCORE_PRIOR * SCORE_STD**2) / (n - 1.0 + SCORE_PRIOR)
+    n = len(left_out)
+    own = SCORE_CONSISTENCY * float((_score_mean(left_out)[1] ** 2).sum())
+    variance = (own + SCORE_PRIOR * SCORE_STD**2) / (n - 1.0 + SCORE_PRIOR)
     return float(np.sqrt(variance * (1.0 + 1.0 / n)))
 
 
-def _score_logs(left_out: Sequence[float]) -> FloatArray:
-    return np.asarray(np.log(np.maximum(left_out, 1e-9)))
+def _score_mean(left_out: Sequence[float]) -> tuple[float, FloatArray]:
+    """Return the mean of the logarithms of scores, and their deviations from it; one far off counts as one less so."""
+    logs, most = np.log(np.maximum(left_out, MIN_SCORE)), MAX_SCORE_STDS * SCORE_STD
+    mean = float(np.median(logs))
+    for _ in range(HUBER_ROUNDS):
+        mean += float(np.clip(logs - mean, -most, most).mean())
+    return mean, np.clip(logs - mean, -most, most)
 
 
 def spans_in_a_row(layout: FeatureLayout, false_alarms: float, false_alarms_per_year: float) -> int:

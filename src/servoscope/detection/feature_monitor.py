@@ -162,7 +162,7 @@ class FeatureLanes:
     ) -> FeatureValues:
         """Feed a block of samples, each of shape (assets, N); the rows are changed in place.
 
-        `channels`: covariates of the one asset, shape (N,) each, where it depends on any.
+        `channels`: covariates, of the same shape each, where one depends on any.
         """
         before, spans = self.values(rows), []
         ended = {asset: [*each] for asset, each in groupby(self._windows.run(rows, r, u, y, restart), itemgetter(0))}
@@ -170,8 +170,9 @@ class FeatureLanes:
             if feature_monitor is None or not (asset in ended or feature_monitor.model.covariates):
                 continue
             windows = (window for _, window in ended.get(asset, ()))
+            own = {name: channels[name][asset] for name in feature_monitor.model.covariates}
             scores = feature_monitor.score(
-                rows[asset, self._column : self._column + feature_monitor.size], windows, channels
+                rows[asset, self._column : self._column + feature_monitor.size], windows, own
             )
             spans += [(asset, span.end - 1, span.value) for span in scores]
         return FeatureValues(before, spans)

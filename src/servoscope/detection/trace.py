@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -47,6 +49,7 @@ def any_exceeded(statistics: tuple[Statistic, ...]) -> BoolArray:
     return np.logical_or.reduce([statistic.exceeded for statistic in statistics])  # type: ignore[no-any-return]
 
 
+COMPARED_COLUMNS = "covariance", "expected", "statistic", "ready"
 ASSET_COLUMNS = "theta", "covariance", "expected", "statistic", "level", "crossed", "ready"
 
 
@@ -92,8 +95,28 @@ class Trace(ShortRepr):
         responses = {name: getattr(self, name) for name in ("ifrf", "ifrf_expected")}
         for name, response in responses.items():
             part[name] = FrequencyResponse(response.frequencies, response.H[asset], response.covariance[asset])
-        part["features"] = None if self.features is None else self.features[asset]
+        for name in ("features", "motion"):
+            part[name] = None if getattr(self, name) is None else getattr(self, name)[asset]
         return Trace(self.t, self.names, threshold=float(np.asarray(self.threshold)[asset, 0]), **part)
+
+    def with_lanes(self, lanes: Sequence[Trace]) -> Trace:
+        """Return that of a fleet whose assets were compared by themselves; a motion not checked has no excess."""
+        healthy = [lane.ifrf_expected for lane in lanes]
+        checked = any(lane.motion is not None for lane in lanes)
+        motion = [np.zeros(len(self.t)) if lane.motion is None else lane.motion for lane in lanes]
+        compared: dict[str, Any] = {
+            name: np.array([getattr(lane, name) for lane in lanes]) for name in COMPARED_COLUMNS
+        }
+        return replace(
+            self,
+            **compared,
+            ifrf_expected=FrequencyResponse(
+                healthy[0].frequencies,
+                np.array([response.H for response in healthy]),
+                np.array([response.covariance for response in healthy]),
+            ),
+            motion=np.array(motion) if checked else None,
+        )
 
     @cached_property
     def statistics(self) -> tuple[Statistic, ...]:

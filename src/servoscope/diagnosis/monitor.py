@@ -16,7 +16,7 @@ from servoscope.core.errors import BaselineError, RecordingError
 from servoscope.detection.covariate_monitor import CovariateHistory
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.monitor_constants import MonitorConstants, compatibility_key, deduplicate
-from servoscope.diagnosis.side_monitors import SideLanes, SideValues
+from servoscope.diagnosis.side_monitors import AssetValues, SideLanes, SideValues
 from servoscope.estimation.frequency_response import FrequencyResponse
 
 if TYPE_CHECKING:
@@ -42,14 +42,14 @@ class Monitor:
         ``"single"`` follows a fleet about twice as fast; the documentation's page on speed says what that costs.
     motion_check
         Whether a motion that the baseline never saw makes an alarm harder, as in `diagnose`: T^2 takes the model for as
-        wrong as it may be there, and the sequential test is silent. For one asset; a `step` then takes a fifth of a
-        millisecond. Where the model holds under any motion nothing changes.
+        wrong as it may be there, and the sequential test is silent. A `step` then takes a fifth of a millisecond, and
+        the assets of a fleet go one after the other there. Where the model holds under any motion nothing changes.
 
     Raises
     ------
     BaselineError
         If the baselines cannot be followed together, or one of them has several operating points; if the motion is to
-        be checked of a fleet, or by a baseline that holds none.
+        be checked by a baseline that holds none.
 
     Examples
     --------
@@ -80,11 +80,6 @@ class Monitor:
                     f"a monitor follows one operating point, this baseline has {', '.join(each.points)}: give "
                     f"baseline.at({each.points[0]!r})"
                 )
-            if each.covariates is not None and self.fleet:
-                raise BaselineError(
-                    f"a fleet is followed without covariates, this baseline has {', '.join(each.covariates.names)}: "
-                    "give each asset a monitor of its own"
-                )
         if share_budget:
             shared = {key: baseline.shared(len(self.baselines)) for key, baseline in distinct.items()}
             self.baselines = tuple(shared[id(baseline)] for baseline in self.baselines)
@@ -98,9 +93,8 @@ class Monitor:
         self._single_precision = precision == "single"
         self._assemble([constants[id(baseline)] for baseline in self.baselines])
         if motion_check:
-            if self.fleet:
-                raise BaselineError("the motion of a fleet is not checked: make one monitor for each asset")
-            self._sides.first.check_motion()
+            for own in constants.values():
+                own.side.check_motion()
             self._size = self._side_at + self._sides.size
 
     def _assemble(self, constants: Sequence[MonitorConstants]) -> None:
@@ -215,7 +209,7 @@ class Monitor:
         restart
             True where a sample does not follow its predecessor by one sample time; same shape.
         channels
-            Covariates by name, shape (N,) each, where the baseline has some. Of NaN, the value before holds, for
+            Covariates by name, of the shape of r each, where a baseline has some. Of NaN, the value before holds, for
             `covariate_hold_s` at most; nothing is estimated before the first value or after that, and none is ready
             outside of the range that was learned.
 
@@ -321,12 +315,19 @@ class Monitor:
     ) -> SideValues:
         """Return what is seen beside the recursions; changes its state, and starts theta where covariates say so."""
         side_values = self._sides.run(rows, signals, gaps, channels)
-        if side_values.averages is not None:  # of one asset
-            signals[0] = np.where(np.isnan(side_values.averages).any(axis=1), np.nan, signals[0])
-        if side_values.start is not None:
-            ((_, recursion),), constants = self._groups, self._constants_of[0].constants
-            state = rows[:, self._prefix_size : self._prefix_size + recursion.size]
-            recursion.named(state)["theta"][0] = np.linalg.solve(constants.basis, side_values.start - constants.origin)
+        if any(values.averages is not None for values in side_values.assets.values()):
+            signals[0] = signals[0].copy()
+        for asset, values in side_values.assets.items():
+            if values.averages is not None:
+                signals[0][asset, np.isnan(values.averages).any(axis=1)] = np.nan
+            if values.start is not None:
+                members, recursion = next(group for group in self._groups if asset in group[0])
+                constants, lane = self._constants_of[asset].constants, int(np.searchsorted(members, asset))
+                state = rows[members, self._prefix_size : self._prefix_size + recursion.size]
+                recursion.named(state)["theta"][lane] = np.linalg.solve(
+                    constants.basis, values.start - constants.origin
+                )
+                rows[members, self._prefix_size : self._prefix_size + recursion.size] = state
         return side_values
 
     def latest(self, state: FloatArray) -> Trace:
@@ -356,7 +357,7 @@ class Monitor:
         beside: SideValues,
     ) -> Trace:
         """Return complete evaluations, shape (assets, K, row), as a trace; the block begins at sample `first`."""
-        motion, features = beside.motion, None if beside.features is None else beside.features.at(index)
+        features = None if beside.features is None else beside.features.at(index)
         n, f = len(self._constants_of[0].expected_theta), np.asarray(self.loop.monitor.frequencies, dtype=np.float64)
         shape = out.shape[:2]
         H = out[..., 4 + n + n * n :].reshape(*shape, len(f), 6)
@@ -383,10 +384,11 @@ class Monitor:
             ifrf=FrequencyResponse(f, *response),
             ifrf_expected=expected,
             features=features if features is None or self.fleet else features[0],
-            motion=None if motion is None else motion.excess,
             **columns,
         )
-        return self._sides.first.compare(trace, beside, index - first)
+        if self.fleet:
+            return self._sides.compare(trace, beside, index - first)
+        return self._sides.first.compare(trace, beside.assets.get(0, AssetValues()), index - first)
 
 
 def _ready_mask(updates: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:

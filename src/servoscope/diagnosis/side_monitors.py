@@ -1,4 +1,4 @@
-"""What follows the samples of one asset beside the recursion: features of windows, covariates, the motion."""
+"""What follows the samples of assets beside the recursion: features of windows, covariates, the motion."""
 
 from __future__ import annotations
 
@@ -21,17 +21,23 @@ from servoscope.detection.warm_up_monitor import WarmUpMonitor
 from servoscope.estimation.pipeline import Pipeline
 
 
-class SideValues(NamedTuple):
-    """What they say of a block."""
+class AssetValues(NamedTuple):
+    """What they say of a block of one asset."""
 
-    features: FeatureValues | None  # of all assets; the others are there for one asset only
     averages: FloatArray | None = None  # of the covariates at each sample, shape (N, k)
     start: FloatArray | None = None  # coefficients to start from, as soon as the covariates are known
     motion: MotionEvidence | None = None
 
 
+class SideValues(NamedTuple):
+    """What they say of a block of several assets."""
+
+    features: FeatureValues | None
+    assets: Mapping[int, AssetValues]  # of those that have covariates or whose motion is checked, by number
+
+
 class SideMonitors:
-    """They share one array of state, each a slice of it; for one asset, in the order of the attributes."""
+    """Those of one asset. They share one array of state, each a slice of it, in the order of the attributes."""
 
     def __init__(self, baseline: Baseline, pipeline: Pipeline) -> None:
         self._baseline, self._pipeline = baseline, pipeline
@@ -73,13 +79,8 @@ class SideMonitors:
         return np.split(state, np.cumsum(sizes)[:-1])
 
     def run(
-        self,
-        state: FloatArray,
-        signals: Sequence[FloatArray],
-        restart: BoolArray,
-        channels: Mapping[str, Any],
-        features: FeatureValues | None,
-    ) -> SideValues:
+        self, state: FloatArray, signals: Sequence[FloatArray], restart: BoolArray, channels: Mapping[str, FloatArray]
+    ) -> AssetValues:
         """Feed r, u and y of a block, shape (N,) each, to all but the features; the state is changed in place."""
         r, u, y = signals
         _, of_covariates, of_motion = self._split(state)
@@ -88,13 +89,12 @@ class SideMonitors:
             motion = self.motion.run(of_motion, r, u, y, restart)
         if self.covariates is not None:
             averages, start = self.covariates.run(of_covariates, (r, u, y), restart, channels)
-        return SideValues(features, averages, start, motion)
+        return AssetValues(averages, start, motion)
 
-    def latest(self, state: FloatArray, features: FeatureValues | None) -> SideValues:
+    def latest(self, state: FloatArray) -> AssetValues:
         """Return what holds at the last sample of a state, as of a block of one sample."""
         _, of_covariates, of_motion = self._split(state)
-        return SideValues(
-            features,
+        return AssetValues(
             None if self.covariates is None else self.covariates.latest(of_covariates)[None],
             None,
             None if self.motion is None else self.motion.latest(of_motion),
@@ -104,18 +104,19 @@ class SideMonitors:
         """Return what is known of the covariates lately."""
         return {} if self.covariates is None else self.covariates.history(self._split(state)[1])
 
-    def compare(self, trace: Trace, values: SideValues, index: npt.NDArray[np.int64]) -> Trace:
+    def compare(self, trace: Trace, values: AssetValues, index: npt.NDArray[np.int64]) -> Trace:
         """Return the evaluations at some samples of a block, compared with what is healthy there."""
         if self.covariates is not None and values.averages is not None:
             trace = self.covariates.compare(trace, values.averages[index])
         if values.motion is None:
             return trace
         softer = values.motion.soften_statistic(trace.statistic, trace.theta, trace.expected, trace.covariance)
-        return replace(trace, statistic=softer if self.covariates is None else np.where(trace.ready, softer, 0.0))
+        statistic = softer if self.covariates is None else np.where(trace.ready, softer, 0.0)
+        return replace(trace, statistic=statistic, motion=values.motion.excess)
 
 
 class SideLanes:
-    """Those of several assets, in the rows of their states from `column` on; only features follow more than one."""
+    """Those of several assets, in the rows of their states from `column` on."""
 
     def __init__(self, lanes: Sequence[SideMonitors], column: int) -> None:
         self._lanes, self._column, self.first = tuple(lanes), column, lanes[0]
@@ -124,6 +125,12 @@ class SideLanes:
     def _features(self) -> FeatureLanes | None:
         features = [lane.features for lane in self._lanes]
         return None if all(feature is None for feature in features) else FeatureLanes(features, self._column)
+
+    @cached_property
+    def _alone(self) -> dict[int, SideMonitors]:
+        """Those that follow one asset after the other, by its number."""
+        followed = (lane.covariates is not None or lane.motion is not None for lane in self._lanes)
+        return {asset: self._lanes[asset] for asset, alone in enumerate(followed) if alone}
 
     @property
     def size(self) -> int:
@@ -144,26 +151,40 @@ class SideLanes:
         rows: FloatArray,
         signals: Sequence[npt.NDArray[Any]],
         restart: BoolArray,
-        channels: Mapping[str, Any],
+        channels: Mapping[str, npt.ArrayLike],
     ) -> SideValues:
-        """Feed r, u and y of a block, shape (assets, N) each; the states are changed in place."""
-        features = None
-        if self._features is None and (len(self._lanes) > 1 or not self.first.size):
-            return SideValues(None)
+        """Feed r, u, y and channels of a block, shape (assets, N) each; the states are changed in place."""
+        if self._features is None and not self._alone:
+            return SideValues(None, {})
         r, u, y = (np.asarray(signal, dtype=np.float64) for signal in signals)
-        if self._features is not None:
-            if len(self._lanes) == 1:
-                channels = read_channels(self.first.logged, channels, r[0].shape)
-            features = self._features.run(rows, r, u, y, restart, channels)
-        if len(self._lanes) > 1:
-            return SideValues(features)
-        return self.first.run(self._own(rows), (r[0], u[0], y[0]), restart[0], channels, features)
+        names = dict.fromkeys(name for lane in self._alone.values() for name in lane.logged)
+        known = read_channels(tuple(names), {name: np.atleast_2d(value) for name, value in channels.items()}, r.shape)
+        features = None if self._features is None else self._features.run(rows, r, u, y, restart, known)
+        values = {
+            asset: lane.run(
+                self._own(rows, asset),
+                (r[asset], u[asset], y[asset]),
+                restart[asset],
+                {name: value[asset] for name, value in known.items()},
+            )
+            for asset, lane in self._alone.items()
+        }
+        return SideValues(features, values)
 
     def latest(self, rows: FloatArray) -> SideValues:
         """Return what holds at the last sample of each state."""
         features = None if self._features is None else FeatureValues(self._features.values(rows), [])
-        return SideValues(features) if len(self._lanes) > 1 else self.first.latest(self._own(rows), features)
+        return SideValues(features, {asset: lane.latest(self._own(rows, asset)) for asset, lane in self._alone.items()})
 
-    def _own(self, rows: FloatArray) -> FloatArray:
-        """Return the state of the one asset."""
-        return rows[0, self._column : self._column + self.first.size]
+    def compare(self, trace: Trace, values: SideValues, index: npt.NDArray[np.int64]) -> Trace:
+        """Return the evaluations of a fleet at some samples of a block, each asset compared with what is healthy."""
+        if not self._alone:
+            return trace
+        compared = [trace.lane(asset) for asset in range(len(self._lanes))]
+        for asset, lane in self._alone.items():
+            compared[asset] = lane.compare(compared[asset], values.assets[asset], index)
+        return trace.with_lanes(compared)
+
+    def _own(self, rows: FloatArray, asset: int) -> FloatArray:
+        """Return the state of an asset."""
+        return rows[asset, self._column : self._column + self._lanes[asset].size]

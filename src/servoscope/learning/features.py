@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import itemgetter
 
 import numpy as np
 
@@ -12,7 +13,9 @@ from servoscope.baseline.feature_model import (
     FeatureModel,
     GroupStatistic,
     fit_groups,
+    robust_limit,
     score_limit,
+    span_scores,
     spans_in_a_row,
 )
 from servoscope.baseline.feature_spans import SpanFeatures
@@ -26,9 +29,11 @@ from servoscope.signals import Recording
 
 MIN_RECORDINGS = 4  # recordings whose scatter is believed; fewer have no features
 BANDS = 7
+MIN_PAST_MEMORIES = 3.0  # in each of two parts of a recording that are compared: in less, one event is half of it
 PAST_BUDGET = 0.1  # of the budget of false alarms, which the comparison with the own past adds
 MIN_PERIODS_PER_WINDOW = 4.0  # periods of the lowest band in a window
 MAX_FREQUENCY_SHARE = 0.45  # of the sample rate: the highest frequency
+MAX_OUTLIER_SHARE = 0.25  # of the recordings that are outliers; more are another load, or another machine
 MAX_WINDOWS = 2000  # of a recording that are learned from
 MAX_PERIOD_SEARCH_SAMPLES = 1_000_000  # of a recording, in which a period is looked for
 MIN_WINDOW_SAMPLES = 64  # samples of a window
@@ -52,8 +57,9 @@ def learn_features(loop: Loop, recordings: Sequence[Recording]) -> tuple[Feature
         return None, [message("learning.features_short", window_s=layout.window / layout.sample_rate)]
     names = tuple(loop.columns.covariates)
     conditions = np.array([[np.nanmean(recording.channels[name]) for name in names] for recording in recordings])
+    past = layout.span_s >= 2.0 * MIN_PAST_MEMORIES * loop.monitor.memory
     spans = [
-        [span._replace(covariates=own) for span in _spans(window, layout)]
+        [span._replace(covariates=own) for span in _spans(window, layout, past)]
         for window, own in zip(windows, conditions, strict=True)
     ]
     low, high = _motion_range(spans)
@@ -67,13 +73,9 @@ def learn_features(loop: Loop, recordings: Sequence[Recording]) -> tuple[Feature
             conditions_of[:i] + conditions_of[i + 1 :],
         )
         statistics = [GroupStatistic.of(group) for group in groups]
-        scores = [
-            (statistic.group.past, statistic.score(*statistic.group.pick(span), span.covariates))
-            for span in own_spans
-            for statistic in statistics
-        ]
-        left_out.append(max(score for past, score in scores if not past))
-        past_left_out += [max(score for past, score in scores if past)] if any(past for past, _ in scores) else []
+        now, later = np.array([span_scores(statistics, span) for span in own_spans]).max(axis=0).tolist()
+        left_out.append(now)
+        past_left_out += [later] if any(statistic.group.past for statistic in statistics) else []
     compares_past = len(past_left_out) == len(spans)
     groups = fit_groups(windows, spans, layout, conditions_of)
     model = FeatureModel(
@@ -88,7 +90,18 @@ def learn_features(loop: Loop, recordings: Sequence[Recording]) -> tuple[Feature
         covariates=names,
         past_limit=score_limit(past_left_out, PAST_BUDGET * share) if compares_past else 0.0,
     )
-    return model, []
+    return model, _describe_outlier(recordings, left_out, robust_limit(left_out, share))
+
+
+def _describe_outlier(recordings: Sequence[Recording], left_out: Sequence[float], limit: float) -> list[Message]:
+    """Return that a healthy recording is unlike the others; none where several are: those are another population."""
+    above = [
+        (recording.name, score / limit) for recording, score in zip(recordings, left_out, strict=True) if score > limit
+    ]
+    if not 0 < len(above) <= MAX_OUTLIER_SHARE * len(recordings):
+        return []
+    name, times = max(above, key=itemgetter(1))
+    return [message("learning.features_outlier", recording=name, times=times)]
 
 
 def _windows(runner: WindowFeatures, recording: Recording) -> list[Window]:
@@ -103,11 +116,14 @@ def _windows(runner: WindowFeatures, recording: Recording) -> list[Window]:
     return windows
 
 
-def _spans(windows: Sequence[Window], layout: FeatureLayout) -> list[SpanFeatures]:
-    """Return the spans of a recording; the last one if it is at least half as long as the others."""
+def _spans(windows: Sequence[Window], layout: FeatureLayout, past: bool) -> list[SpanFeatures]:
+    """Return the spans of a recording; the last one if it is at least half as long as the others.
+
+    `past`: with their later windows less their earlier ones.
+    """
     numbers = sorted({window.span for window in windows})
     members = [[window for window in windows if window.span == number] for number in numbers]
-    features = [SpanFeatures.of(member, layout, past=True) for member in members]
+    features = [SpanFeatures.of(member, layout, past=past) for member in members]
     return [span for span in features if 2.0 * span.counts[0] >= layout.span] or features[:1]
 
 

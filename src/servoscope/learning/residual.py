@@ -12,6 +12,7 @@ from servoscope.learning.recursion import HealthyRecordings
 
 MIN_RECORDINGS = 6  # so that five judge each: fewer do not tell a drift from scatter
 TOP_SPEED_QUANTILE = 0.99  # of the speed of a recording
+SHIFT_MARGIN = 2.0  # of the limit: differences of halves scatter with heavier tails than features
 ACCELERATION_QUANTILES = (1.0 / 3.0, 2.0 / 3.0)  # braking, neither, accelerating
 
 
@@ -49,5 +50,5 @@ def learn_residuals(healthy: HealthyRecordings, theta: FloatArray) -> ResidualMo
     whole, shift = left_out[np.isfinite(left_out).all(axis=1)].T.tolist()
     if len(whole) < MIN_RECORDINGS:
         return None
-    limits = score_limit(whole, share), score_limit(shift, PAST_BUDGET * share)
+    limits = score_limit(whole, share), SHIFT_MARGIN * score_limit(shift, PAST_BUDGET * share)
     return ResidualModel.of(layout, residuals).model_copy(update={"limits": limits})
