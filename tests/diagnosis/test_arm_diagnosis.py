@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from servoscope.baseline.arm import ArmBaseline
 from servoscope.baseline.baseline import Baseline
 from servoscope.cli import app
 from servoscope.core.errors import BaselineError, NotEnoughError, RecordingError
+from servoscope.core.messages import set_language
 from servoscope.diagnosis.arm import diagnose_arm, examine_arm
 from servoscope.learning.arm import learn_arm
 from servoscope.learning.arm_setup import calibrate_load
@@ -66,6 +68,13 @@ def test_a_simulated_arm(simulated: tuple[ArmBaseline, Read], tmp_path: Path) ->
     assert diagnosis.onset_s is not None and diagnosis.onset_s[1] == pytest.approx(15.0, abs=1.5)
     page = render_arm_page(diagnosis, examination, baseline)
     assert "friction of elbow" in page and page.count("<h2>The arm and its joints</h2>") == 1
+    set_language("de")
+    try:
+        words = re.sub(r"<(style|svg|code).*?</\1>", "", render_arm_page(diagnosis, examination, baseline), flags=re.S)
+    finally:
+        set_language("en")
+    assert "Reibung von elbow" in words
+    assert re.findall(r">[^<]*\b(?:the|of|with|friction|fault|since|baseline|recordings?)\b[^<]*<", words) == []
     loaded = diagnose_arm(baseline, record(22, ArmChange("payload", 2.0, 6, 15.0)))
     assert loaded.verdict == "healthy" and loaded.faults[0].mass_kg is not None
     assert loaded.faults[0].mass_kg[0] == pytest.approx(2.0, abs=0.3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -24,6 +25,8 @@ from servoscope.models.arm.settings import ArmLoop
 VERSION = 2
 HEAD_LENGTH = 200  # characters, in which a baseline says what it is
 UNKNOWN = "unknown"
+# terms that stand for what depends on the motion before a joint turns round, and their standard deviation, as a share
+MOTION_TERMS, MOTION_SHARE = (".lag", ".friction_curve"), 0.5
 PAYLOAD = ("m", "mx", "my", "mz")
 # standard deviations of a change, by kind: kg and kg m of a payload, rad of an encoder, shares of friction, of the
 # joint's rms torque, of the drive gain, of the load on a joint
@@ -148,7 +151,7 @@ class ArmBaseline(BaselineModel):
         """The information (P + D, P + D) of what coefficients are off, and of how recordings differ."""
         size = len(self.theta)
         prior = np.diag(np.concatenate([np.zeros(size), np.array(self.between) ** -2.0]))
-        prior[:size, :size] = self.information
+        prior[:size, :size] = loosen(np.array(self.information), self.names, np.array(self.theta))
         return prior
 
     @cached_property
@@ -187,6 +190,13 @@ class ArmBaseline(BaselineModel):
         except (ValidationError, LoopError) as error:
             raise BaselineError(f"{path}: damaged baseline, {str(error).splitlines()[0]}; learn it again") from None
         return baseline
+
+
+def loosen(information: FloatArray, names: Sequence[str], theta: FloatArray) -> FloatArray:
+    """Return the information of coefficients (P, P), of which those of lag and curve differ between motions."""
+    size = np.array([MOTION_SHARE * abs(x) * name.endswith(MOTION_TERMS) for name, x in zip(names, theta, strict=True)])
+    # (information^-1 + size^2)^-1
+    return np.asarray(np.linalg.solve(np.eye(size.size) + information * size**2, information))
 
 
 def coefficient_names(model: ArmModel) -> tuple[str, ...]:

@@ -218,7 +218,9 @@ def _explain(
         message("arm.rival", kind=kind, joint=_joint(joint), probability=odds[kind, joint]) for kind, joint in likely
     ]
     joints = sorted({joint for _, joint in likely if joint})
-    told = message("arm.would_tell_joints" if len(joints) > 1 else "arm.would_tell", joints=joints or ["the last link"])
+    told = message(
+        "arm.would_tell_joints" if len(joints) > 1 else "arm.would_tell", joints=joints or [message("arm.last_link")]
+    )
     return "fault", message("arm.ambiguous", rivals=rivals, since=since, told=told), interval, reasons
 
 

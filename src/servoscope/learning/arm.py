@@ -14,6 +14,7 @@ from servoscope.baseline.arm import (
     complete_columns,
     deviation_columns,
     deviation_scales,
+    loosen,
 )
 from servoscope.baseline.records import BaselineSource
 from servoscope.core.arrays import FloatArray, to_tuples
@@ -176,7 +177,8 @@ def _judge_each(
     for i, one in enumerate(scatter.information):
         others = random_effect(changes[:i] + changes[i + 1 :], scatter.scale, BETWEEN_SHARE)
         prior = np.zeros((len(fit.theta) + scatter.scale.size,) * 2)
-        prior[rest, rest] = (fit.A.sum(0) + fit.prior) / typical - several * fit.A[i] / typical
+        known = (fit.A.sum(0) + fit.prior - several * fit.A[i]) / typical
+        prior[rest, rest] = loosen(known, coefficient_names(model), fit.theta)
         prior[moves, moves] = np.diag((others if several else scatter.between) ** -2.0)
         test = ChangeTest(one, prior, arm_causes(model), scatter.scale, scatter.drift)
         if i == len(recordings) // 2:
