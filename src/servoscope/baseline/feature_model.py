@@ -263,9 +263,8 @@ class GroupStatistic(NamedTuple):
 
 def is_near(learned: FloatArray, covariates: FloatArray) -> bool:
     """Return whether covariates (k,) are within the range of learned ones (n, k), or next to it."""
-    low, high = learned.min(axis=0), learned.max(axis=0)
-    edge = MAX_EXTRAPOLATION_SHARE * (high - low)
-    return bool(((covariates >= low - edge) & (covariates <= high + edge)).all())
+    edge = MAX_EXTRAPOLATION_SHARE * np.ptp(learned, axis=0)
+    return bool(((covariates >= learned.min(axis=0) - edge) & (covariates <= learned.max(axis=0) + edge)).all())
 
 
 def span_scores(statistics: Sequence[GroupStatistic], span: SpanFeatures) -> tuple[float, float]:
