@@ -34,9 +34,10 @@ from accuracy.cylinder_days import (
 
 WINDOW_S, CUTOFF_HZ = 10.0, 10.0
 MEMORY_S = 15.0  # two cycles of production
+CYLINDER = {"kind": "cylinder", "terms": ["spring", "process", "overlap", "offset"], "contact": 0.06}
 PLANTS: dict[str, dict[str, object]] = {
-    "linear": {"kind": "polynomial", "order": 2, "offset": True},
-    "cylinder": {"kind": "cylinder", "terms": ["spring", "process", "overlap", "offset"], "contact": 0.06},
+    "cylinder": CYLINDER,
+    "cylinder, oil temperature logged": CYLINDER,
 }
 # by fault of the rig: what a diagnosis may call it
 NAMES: dict[str, set[str]] = {
@@ -54,12 +55,12 @@ NAMES: dict[str, set[str]] = {
 }
 
 
-def loop(plant: dict[str, object]) -> ss.Loop:
-    """Return the loop file of the cylinder."""
+def loop(words: str) -> ss.Loop:
+    """Return the loop file of one of `PLANTS`."""
     monitor = {"cutoff": CUTOFF_HZ, "memory": MEMORY_S, "frequencies": [0.5, 2.0]}
-    # a linear plant has a negative inertia here, which `learn` would refuse
-    settings = {"name": "cylinder", "sample_rate": RATE, "implausible": "note", "plant": plant, "monitor": monitor}
-    return ss.Loop.from_dict(settings)
+    loop = {"name": "cylinder", "sample_rate": RATE, "plant": PLANTS[words], "monitor": monitor}
+    columns = {"covariates": {"T_oil": "T_oil"}} if "temperature" in words else {}
+    return ss.Loop.from_dict({**loop, "columns": columns})
 
 
 def rows(
@@ -92,10 +93,10 @@ def main() -> None:
     scores = [judge(one, healthy, judged) for one in detectors(WINDOW_S, CUTOFF_HZ)]
     simple = [[x > one.limit for x in one.largest] for one in scores]
     tables, values = [], {}
-    for words, plant in PLANTS.items():
+    for words in PLANTS:
         if given.plant not in (None, words):
             continue
-        baseline = ss.learn(loop(plant), healthy)
+        baseline = ss.learn(loop(words), healthy)
         told = [ss.diagnose(baseline, recording) for recording in judged]
         found = [one.verdict == "fault" for one in told]
         named = [{fault.name for fault in one.faults} for one in told]
@@ -110,7 +111,9 @@ def main() -> None:
         note = f"Learned: {len(healthy)} {'mixed' if given.mixed else 'production'} days of a minute at {RATE:g} Hz."
         tables.append(Table(f"Cylinder, plant {words}", note, heads, tuple(rows(days, found, named, simple))))
         faults = [k for k, day in enumerate(days) if day.fault in FAULTS]
+        process = [names for names, day in zip(named, days, strict=True) if day.fault == "process"]
         values |= {
+            f"{words}.process": f"{sum(names == {'process_force'} for names in process)}",
             f"{words}.false": f"{sum(x for x, day in zip(found, days, strict=True) if not day.fault)}",
             f"{words}.found": f"{sum(found[k] for k in faults)}",
             f"{words}.right": f"{sum(bool(named[k]) and named[k] <= NAMES.get(days[k].fault, set()) for k in faults)}",

@@ -31,6 +31,7 @@ from servoscope.baseline.records import (
     Vector,
     parse_stored_loop,
 )
+from servoscope.baseline.residual_model import ResidualModel
 from servoscope.baseline.sensors import SensorModel
 from servoscope.baseline.threshold import t2_threshold
 from servoscope.baseline.version_2 import FLAT_VERSION, group_flat_fields
@@ -69,10 +70,10 @@ class Baseline(ShortRepr, BaselineMemory):
         Warnings of `learn`; faults known from labelled recordings.
     exact
         What the exact predictor says of the healthy recordings; None where there is none.
-    sensors, features, motion, axis, covariates
+    sensors, features, motion, axis, covariates, residual
         Further evidence, None where there is none: how the sensors of the output disagree; what four or more recordings
         show besides coefficients; the motion that they hold; the healthy motor axis that its refit starts from; how
-        coefficients move with covariates, theta being theirs in the middle of the learned range.
+        coefficients move with covariates, theta being theirs in the middle of the learned range; what these leave of u.
     point, others
         Name of the operating point, empty where none was declared; the baselines of the other points. A baseline with
         others is itself that of the first point.
@@ -105,6 +106,7 @@ class Baseline(ShortRepr, BaselineMemory):
     motion: MotionRange | None = None
     axis: AxisModel | None = None
     covariates: CovariateModel | None = None
+    residual: ResidualModel | None = Field(default=None, exclude_if=lambda value: value is None)
     point: str = ""
     others: tuple[Baseline, ...] = ()
     revision: Revision = Revision()
@@ -186,7 +188,7 @@ class Baseline(ShortRepr, BaselineMemory):
         theta = model.theta(origin := np.array(self.theta), c)
         covariance = self.covariance_array() + model.theta_covariance(origin, c)
         update: dict[str, Any] = {"theta": tuple(theta.tolist()), "covariance": tuple(map(tuple, covariance.tolist()))}
-        update["covariates"] = None
+        update |= {"covariates": None, "residual": None}
         update["features"] = None if self.features is None else self.features.at(c)
         moved: dict[str, Any] = {}
         if self.healthy.theta:

@@ -159,13 +159,7 @@ class FeatureModel(_FeatureRecord):
         seen = np.isfinite(span.motion)
         low, high = np.array(self.motion_low), np.array(self.motion_high)
         moved = bool(((span.motion >= low) & (span.motion <= high))[seen].all())
-        return moved and (not self.covariates or self._is_near(span.covariates))
-
-    def _is_near(self, covariates: FloatArray) -> bool:
-        learned = np.array(self.groups[0].covariates)
-        low, high = learned.min(axis=0), learned.max(axis=0)
-        edge = MAX_EXTRAPOLATION_SHARE * (high - low)
-        return bool(((covariates >= low - edge) & (covariates <= high + edge)).all())
+        return moved and (not self.covariates or is_near(np.array(self.groups[0].covariates), span.covariates))
 
     def conformal_p_value(self, span: SpanFeatures) -> float:
         """Return how often a further healthy recording would be as unlike the others, whatever their distribution.
@@ -265,6 +259,12 @@ class GroupStatistic(NamedTuple):
             return 0.0
         C = self.predicted(covariates) + self.within * max(1.0 / windows - 1.0 / self.group.windows, 0.0)
         return float(z[seen] @ np.linalg.solve(C[np.ix_(seen, seen)], z[seen])) / int(seen.sum())
+
+
+def is_near(learned: FloatArray, covariates: FloatArray) -> bool:
+    """Return whether covariates (k,) are within the range of learned ones (n, k), or next to it."""
+    edge = MAX_EXTRAPOLATION_SHARE * np.ptp(learned, axis=0)
+    return bool(((covariates >= learned.min(axis=0) - edge) & (covariates <= learned.max(axis=0) + edge)).all())
 
 
 def span_scores(statistics: Sequence[GroupStatistic], span: SpanFeatures) -> tuple[float, float]:

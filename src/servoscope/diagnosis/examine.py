@@ -69,9 +69,8 @@ class Examination:
     def from_recording(cls, baseline: Baseline, recording: Recording, *, quick: bool = False) -> Examination:
         """Run the recursion over the recording and compare it with what a healthy loop would show.
 
-        `quick`: whether features are left out, and the level of the sequential test may be held against the baseline's
-        own limits where neither these nor those for the recording's reference, which take several times as long as all
-        the rest, raise an alarm.
+        `quick`: whether features and residual are left out, and the sequential test may be held against the baseline's
+        own limits where neither these nor those for the recording's reference, which take far longer, raise an alarm.
 
         Raises RecordingError if the recording's sample rate is not the loop's.
         """
@@ -91,8 +90,9 @@ class Examination:
                 along = follow_warm_up(pipeline, model, theta, recording, memory)
             place = ", ".join(filter(None, [baseline.point, along.place]))
             # features are compared at the covariates of each span, and an axis at those of each sample
-            axis = {"axis": baseline.axis} if baseline.axis is not None and baseline.axis.moves is not None else {}
-            followed: dict[str, Any] = {"point": place, "features": baseline.features, **axis}
+            moves = baseline.axis is not None and baseline.axis.moves is not None
+            kept = "features", "residual", *(["axis"] if moves else [])
+            followed: dict[str, Any] = {"point": place, **{name: getattr(baseline, name) for name in kept}}
             baseline = baseline.at(dict(zip(model.names, along.averages[-1].tolist(), strict=True)))
             baseline = baseline.model_copy(update=followed)
         exam = _run_quickly(baseline, recording) if quick and along is None else None
@@ -151,10 +151,9 @@ class Examination:
     @cached_property
     def statistics(self) -> tuple[Statistic, ...]:
         """The statistics that raise the alarm: T^2, the sequential test and, where they were learned, the features."""
-        features = self.features.at(self.estimates.index) if self.features is not None else None
-        return detection_statistics(
-            self.statistic, self.baseline.thresholds.statistic, self.estimates.level, self.ready, features
-        )
+        e, limit = self.estimates, self.baseline.thresholds.statistic
+        features = self.features.at(e.index) if self.features is not None else None
+        return detection_statistics(self.statistic, limit, e.level, self.ready, features)
 
     @cached_property
     def features(self) -> FeatureEvidence | None:
@@ -162,11 +161,11 @@ class Examination:
         model = self.baseline.features
         return None if model is None or self.quick else FeatureEvidence.of(model, self.recording)
 
-    @property
-    def _of_coefficients(self) -> tuple[Statistic, ...]:
-        return detection_statistics(
-            self.statistic, self.baseline.thresholds.statistic, self.estimates.level, self.ready
-        )
+    @cached_property
+    def residual_ratios(self) -> FloatArray:
+        """What the healthy coefficients leave of u over its limits, see `ResidualModel.ratios`; NaN: no evidence."""
+        model = None if self.quick else self.baseline.residual
+        return np.full(2, np.nan) if model is None else model.ratios_of(self.pipeline, self.recording)
 
     @property
     def features_changed_s(self) -> float | None:
@@ -177,14 +176,16 @@ class Examination:
     @cached_property
     def apparent_alarm(self) -> npt.NDArray[np.bool_]:
         """Whether a statistic of the coefficients was above its limit, after the delays, shape (K,)."""
-        return self._changed | apply_alarm_delays(any_exceeded(self._of_coefficients), *self.pipeline.delays)
+        return self._changed | apply_alarm_delays(any_exceeded(self.statistics[:2]), *self.pipeline.delays)
 
     @property
     def _changed(self) -> npt.NDArray[np.bool_]:
         """Whether a change within the recording had been detected, or was not yet repaired, shape (K,)."""
         change, index = self.change, self.estimates.index
-        if change is None or change.repaired:
-            return np.asarray(index < (0 if change is None else change.onset))
+        if change is None:  # what is left of u speaks of the whole recording
+            return np.asarray((index == index[-1:].sum()) & (self.residual_ratios > 1.0).any())
+        if change.repaired:
+            return np.asarray(index < change.onset)
         return np.asarray(index >= index[-1:].min(initial=change.detected))  # or detected after the last evaluation
 
     @cached_property
@@ -199,7 +200,7 @@ class Examination:
             T2 = np.where(self.ready[at], t2_statistic(e.theta[at], self.expected[at], C), 0.0)
             # the sequential test knows no model error
             exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & (self.motion_excess(at) < UNSEEN_EXCESS))
-        exceeded &= any_exceeded(self._of_coefficients)
+        exceeded &= any_exceeded(self.statistics[:2])
         self.release()
         return self._changed | apply_alarm_delays(exceeded, *self.pipeline.delays)
 

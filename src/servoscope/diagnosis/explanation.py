@@ -204,6 +204,10 @@ def _alarm_reason(exam: Examination, interval: FaultInterval) -> Message | None:
         return message("diagnosis.alarm_cusum", t=interval.detected_at_s)
     value, limit = float(exam.statistic[first]), exam.baseline.thresholds.statistic
     if value <= limit:  # then the other tests alone may have raised it
+        excess = float(np.nanmax(exam.residual_ratios, initial=0.0))
+        if exam.change is None and excess > 1.0:
+            kind = "shift" if exam.residual_ratios[1] == excess else "residual"
+            return message(f"diagnosis.alarm_{kind}", excess=excess)
         kind = "cusum" if exam.change is None else "change"
         return message(f"diagnosis.alarm_{kind}", t=interval.detected_at_s)
     return message("diagnosis.alarm_t2", t=interval.detected_at_s, value=value, limit=limit)

@@ -121,7 +121,8 @@ class _SignatureSearch:
         return J, float(np.linalg.slogdet(Sigma)[1])
 
     def _covariance(self, x: float, s: FloatArray) -> FloatArray:
-        Sigma = self.correlation + np.diag((SYSTEMATIC_ERROR_SHARE * s) ** 2 + 1e-12)
+        off = (SYSTEMATIC_ERROR_SHARE * s) ** 2 + self.signature.angle**2 * (s @ s) + 1e-12
+        Sigma = self.correlation + np.diag(off)
         if self.signature.scatter is not None:
             Sigma = Sigma + self.signature.scatter(x) / np.outer(self.size, self.size)
         return np.asarray(Sigma)

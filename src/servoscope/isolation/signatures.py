@@ -73,6 +73,7 @@ def _plant_signatures(
         else parameter_signature(fault, _power_shift(baseline, plant.exponents(fault.parameter), learned))
         for fault in moving
     ]
+    single = [replace(signature, angle=plant.ray_angles.get(signature.fault.parameter, 0.0)) for signature in single]
     return single + [
         _ray_signature(ray, learned, directions, _healthy_std(baseline, ray.full[0][0])) for ray in plant.rays
     ]

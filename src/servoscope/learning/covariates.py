@@ -147,6 +147,8 @@ def _stretches_of(
             c = columns[rows][part.ok]
             if part.ok.sum() < MIN_SAMPLES_PER_COEFFICIENT * g.phi.shape[1] or np.isnan(c).all(axis=0).any():
                 continue
+            if not part.phi[part.ok].any(axis=0).all():  # a motion that never asks for a coefficient
+                continue
             theta = least_squares(part)
             found.append((np.nanmean(c, axis=0), theta, coloured_covariance(part, fit.tuning)))
     return found

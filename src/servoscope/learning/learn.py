@@ -35,6 +35,7 @@ from servoscope.learning.recursion import (
     form_healthy_recordings,
     tune_pipeline,
 )
+from servoscope.learning.residual import learn_residuals
 from servoscope.learning.scatter import follow_recordings, learn_scatter, learn_thresholds, widen_scatter
 from servoscope.models.loop import Loop
 from servoscope.models.plants.axis import AxisPlant
@@ -202,7 +203,15 @@ def _assemble_baseline(
         covariates=healthy.covariates,
     )
     progress("predictor")
-    return _with_exact_predictor(baseline, recordings)
+    return _with_residuals(_with_exact_predictor(baseline, recordings), healthy)
+
+
+def _with_residuals(baseline: Baseline, healthy: HealthyRecordings) -> Baseline:
+    """Learn the residual, unless an exact plant leaves noise alone: the tests of the coefficients know its size."""
+    exact = baseline.exact is not None and baseline.exact.misfit <= 1.0
+    if exact or healthy.loop.monitor.hidden_warm_up:
+        return baseline
+    return baseline.model_copy(update={"residual": learn_residuals(healthy, np.array(baseline.theta))})
 
 
 def _with_exact_predictor(baseline: Baseline, recordings: Sequence[Recording]) -> Baseline:

@@ -101,6 +101,8 @@ class Plant(BaseModel, abc.ABC):
     translations: ClassVar[Mapping[str, Mapping[str, str]]] = {}
     # whether its parameters are its coefficients and the input gain, so that a healthy estimate gives their ratios
     parameters_are_coefficients: ClassVar[bool] = False
+    # by parameter, the angle by which coefficients leave its curve, in their standard deviations [rad]
+    ray_angles: ClassVar[Mapping[str, float]] = {}
 
     kind: str  # name of the plant in a loop file
     # factor on u as recorded, before anything else is done with it, for example a torque constant

@@ -106,6 +106,8 @@ class CylinderPlant(TermPlant):
     """
 
     EXPONENTS: ClassVar[Mapping[str, Mapping[str, float]]] = EXPONENTS
+    # the root of the load pressure is of first order here: three times the process force also moves the overlap
+    ray_angles: ClassVar[Mapping[str, float]] = {"process": 0.15}
     translations: ClassVar[Mapping[str, Mapping[str, str]]] = read_translations(__file__)
 
     kind: Literal["cylinder"] = "cylinder"

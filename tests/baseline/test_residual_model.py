@@ -1,0 +1,117 @@
+"""What the healthy coefficients leave of u, over whole recordings and in their halves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import servoscope as ss
+from servoscope.baseline.residual_model import CLASSES, FADE_S, SIZE, ResidualLayout, ResidualModel
+from servoscope.diagnosis.examine import Examination
+from servoscope.signals import Recording
+from servoscope.simulation import CylinderRig, FaultEvent, cylinder_motion, simulate_cylinder
+
+DURATION_S = 30.0
+
+
+def day(seed: int, *faults: FaultEvent, kind: str = "production", duration_s: float = DURATION_S) -> Recording:
+    rig = CylinderRig(temperature=38.0 + 3.0 * (seed % 6))
+    log, _ = simulate_cylinder(cylinder_motion(kind, duration_s, 250.0, seed), rig, faults=list(faults), seed=seed)
+    return replace(log, name=f"{kind} {seed}", channels={"oil": log.channels["T_oil"]})
+
+
+@pytest.fixture(scope="module")
+def learned() -> ss.Baseline:
+    loop = ss.Loop.from_dict(
+        {
+            "name": "cylinder",
+            "sample_rate": 250.0,
+            "plant": {"kind": "cylinder", "terms": ["spring", "process", "overlap", "offset"], "contact": 0.06},
+            "monitor": {"cutoff": 10.0, "memory": 7.0, "frequencies": [0.5, 2.0]},
+            "columns": {"covariates": {"oil": "oil temperature"}},
+        }
+    )
+    return ss.learn(loop, [day(seed) for seed in range(7)])
+
+
+def ratios(baseline: ss.Baseline, recording: Recording) -> np.ndarray:
+    return Examination.from_recording(baseline, recording).residual_ratios
+
+
+def model_of(baseline: ss.Baseline) -> ResidualModel:
+    assert baseline.residual is not None
+    return baseline.residual
+
+
+def obvious_features(layout: ResidualLayout, baseline: ss.Baseline, recording: Recording, part: slice) -> np.ndarray:
+    """Class by class, over whole arrays."""
+    pipeline, y = baseline.pipeline(), recording.y - layout.origin
+    g = pipeline.regression(recording.r, recording.u, recording.y, recording.restart)
+    k = pipeline.kinematics.regression(y, y, y, recording.restart)
+    ok = np.flatnonzero(g.ok & k.ok)
+    ok = ok[np.isin(ok, np.arange(recording.samples)[part])]
+    y, v, a = k.phi[ok].T
+    e = (g.eta - g.phi @ np.array(layout.theta))[ok] - np.array(layout.means)[layout.cell(k.phi[ok])]
+    classes = np.searchsorted(layout.speeds, v, side="right")
+    means = [e[classes == j].sum() / ((classes == j).sum() + FADE_S * 250.0) for j in range(CLASSES)]
+    signs = a, abs(a) * np.sign(v), y, y * np.sign(v)
+    return np.array([*means, *((e * w).mean() / np.sqrt((w**2).mean()) for w in signs), np.sqrt((e**2).mean())])
+
+
+def test_features_are_those_of_the_obvious_way(learned: ss.Baseline) -> None:
+    layout, recording = model_of(learned).layout, day(20)
+    features = layout.features(learned.pipeline(), recording).features
+    half = recording.samples // 2
+    for row, part in zip(features, (slice(None), slice(half), slice(half, None)), strict=True):
+        np.testing.assert_allclose(row, obvious_features(layout, learned, recording, part), rtol=1e-9, atol=1e-12)
+    assert features.shape == (3, SIZE)
+
+
+def test_healthy_days_are_healthy_and_a_fault_shows_in_whole_or_half(learned: ss.Baseline) -> None:
+    for seed in range(30, 36):
+        assert (ratios(learned, day(seed)) < 1.0).all()
+    whole, _ = ratios(learned, day(40, FaultEvent("gain_extend", 0.94, 0.0)))
+    assert whole > 1.0
+    _, shift = ratios(learned, day(41, FaultEvent("overlap", 3.5, 15.0)))
+    assert shift > 1.0
+
+
+def test_an_alarm_of_the_residual_alone_is_explained(learned: ss.Baseline) -> None:
+    quiet = learned.thresholds.model_copy(update={"statistic": 1e9})
+    baseline = learned.model_copy(update={"thresholds": quiet, "features": None})
+    diagnosis = ss.diagnose(baseline, day(42, FaultEvent("pump_pressure", 0.85, 0.0)))
+    assert diagnosis.verdict == "fault"
+    assert any("what the healthy coefficients leave of u" in str(reason) for reason in diagnosis.reasons)
+    whole = ss.diagnose(learned, day(42, FaultEvent("pump_pressure", 0.85, 0.0)))
+    assert [fault.name for fault in whole.faults] == ["supply"]
+    assert whole.faults[0].interval[0] < 0.86 < whole.faults[0].interval[1] + 0.03
+
+
+def test_a_short_recording_is_no_fault(learned: ss.Baseline) -> None:
+    for seed in range(50, 54):
+        assert not (ratios(learned, day(seed, duration_s=10.0)) > 1.0).any()
+
+
+def test_another_motion_or_temperature_is_no_evidence(learned: ss.Baseline) -> None:
+    assert np.isnan(ratios(learned, day(60, kind="sweep"))).all()
+    hot = day(61)
+    hot = replace(hot, channels={"oil": hot.channels["oil"] + 30.0})
+    assert np.isnan(model_of(learned).ratios_of(learned.pipeline(), hot)).all()
+
+
+def test_it_is_stored_and_needs_six_recordings(learned: ss.Baseline, tmp_path: Path) -> None:
+    learned.save(tmp_path / "baseline.json")
+    again = ss.Baseline.load(tmp_path / "baseline.json")
+    recording = day(70)
+    np.testing.assert_array_equal(ratios(again, recording), ratios(learned, recording))
+    few = ss.learn(learned.loop, [day(seed) for seed in range(4)])  # one is needed for the temperature
+    assert few.residual is None
+    assert few.at({"oil": 44.0}).residual is None
+
+
+def test_a_motion_that_never_asks_for_a_coefficient_leaves_the_covariates_of_others(learned: ss.Baseline) -> None:
+    days = [day(seed) for seed in range(4)] + [day(80, kind="teach")]
+    assert ss.learn(learned.loop, days).covariates is not None
