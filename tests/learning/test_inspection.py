@@ -61,6 +61,8 @@ def test_a_sound_recording_is_usable_with_and_without_its_loop(rig: dict[str, An
         found = inspect(recording, loop)
         assert found.verdict == "usable", found.summary
         assert found.fit is not None and found.fit.explained > 0.999
+        assert found.free_run is not None and found.free_run.explained is not None
+        assert found.free_run.explained > 0.999
         assert found.residual is not None and found.residual.white
         assert found.residual.repeating == pytest.approx(0.0, abs=0.1)
         assert found.residual.period_s == pytest.approx(10.0)
@@ -203,7 +205,7 @@ def test_a_constant_reference_and_pure_noise_do_not_crash(rig: dict[str, Any]) -
     found = inspect(still, Loop.from_dict(rig))
     assert found.verdict == "not usable" and "constant" in kinds(found, "care") and "rest" in kinds(found, "stop")
     assert [str(line) for line in found.recommendations] == ["record while the machine moves"]
-    assert not {"frequency", "explained", "band"} & {finding.kind for finding in found.findings}
+    assert not {"frequency", "explained", "free_run", "band"} & {finding.kind for finding in found.findings}
     rng = np.random.default_rng(3)
     noise = replace(still, r=rng.normal(size=3000), u=rng.normal(size=3000), y=rng.normal(size=3000))
     assert inspect(noise).verdict == "not usable"
@@ -259,6 +261,7 @@ def test_emps_is_explained_and_its_parameters_are_the_authors(shared_data: Path)
     assert values["coulomb_friction"] == pytest.approx(20.39, rel=0.01)
     assert values["offset"] == pytest.approx(-3.165, rel=0.03)
     assert found.fit.explained > 0.998
+    assert found.free_run is not None and (found.free_run.explained or 0.0) > 0.99
     assert found.residual is not None and found.residual.period_s == pytest.approx(6.24)
     assert (found.residual.repeating or 0.0) > 0.8 and 0.01 < found.residual.model_error < 0.05
     generic = inspect(recording)

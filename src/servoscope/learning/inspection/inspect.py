@@ -13,7 +13,7 @@ from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.core.messages import Message, MessageText, message
 from servoscope.core.short_repr import ShortRepr
 from servoscope.estimation.filter_bank import filter_cutoff
-from servoscope.learning.inspection import delay, excitation, model_order, signals
+from servoscope.learning.inspection import delay, excitation, model_order, signals, simulation_fit
 from servoscope.learning.inspection import residual as leftover
 from servoscope.learning.inspection.excitation import FrequencyExcitation, Spectra
 from servoscope.learning.inspection.model_order import RegressionFit, Regressors
@@ -216,6 +216,7 @@ def _measure_with_model(
             "fit": _summarise_fit(model, g, which, fit, ungated),
             "residual": residual,
             "delay": _check_delay(delay.estimate_delay(recording, g, which, fit, independent), recording, loop, g),
+            "free_run": simulation_fit.free_run(recording, g, which, fit),
         }
     )
     return m, InspectionTraces(recording, spectra, fit.v, used, rho)

@@ -1,4 +1,4 @@
-"""How well an inverse model explains a recording: regression, and order."""
+"""How well an inverse model explains a recording: regression, order, free run, and what is left over."""
 
 from __future__ import annotations
 

@@ -16,6 +16,7 @@ from servoscope.learning.inspection.signals import (
     Sampling,
     Saturation,
 )
+from servoscope.learning.inspection.simulation_fit import FreeRun
 
 
 class Coefficient(InspectionModel):
@@ -84,6 +85,7 @@ class InspectionMeasurements(InspectionModel):
     best_order: ModelOrderFit | None = None
     fit: InverseModelFit | None = None
     delay: Delay | None = None
+    free_run: FreeRun | None = None
     residual: Residual | None = None
 
     @property

@@ -251,6 +251,8 @@ def _model_findings(m: InspectionMeasurements, loop: Loop | None) -> Iterator[_F
             yield "delay", "care", _inspection("other_delay", **values)
         else:
             yield "delay", "note", _inspection("delay", delay=d.words)
+    if m.free_run is not None:
+        yield "free_run", "note", m.free_run.words
     if m.residual is not None:
         yield from _residual_findings(m.residual, m.fit)
 
