@@ -21,10 +21,14 @@ from servoscope.assessment.assess import assess
 from servoscope.cli.render import history, results
 from servoscope.cli.render.assessment import print_assessment
 from servoscope.cli.render.diagnosis import print_diagnosis
+from servoscope.cli.render.fleet import print_fleet
 from servoscope.cli.service import COLUMNS
 from servoscope.core import messages
 from servoscope.core.messages import catalogue, languages, message, render, translate
 from servoscope.diagnosis.diagnose import diagnose_with_trace
+from servoscope.fleet.common_cause import Cause
+from servoscope.fleet.report import render_fleet_page
+from servoscope.fleet.summary import AssetSummary, Fleet
 from servoscope.learning.inspection import inspect
 from servoscope.models import plants
 from servoscope.models.plants import axis
@@ -189,6 +193,25 @@ def test_no_sentence_is_left_outside_of_the_catalogue(monkeypatch: pytest.Monkey
         "error",
     }
     assert set(re.findall(r"[a-z]{3,}", outside_of_messages(text))) - data == set()
+
+
+def test_no_word_of_a_fleet_is_left_outside(monkeypatch: pytest.MonkeyPatch) -> None:
+    add_marked_language(monkeypatch)
+    monkeypatch.setattr(messages, "LANGUAGE", "zz")
+    cause = Cause("K", "G", ("P1", "P2"), (0.5, 0.5), 0.99, "p_s", 0.9, 0.8, (0.7, 0.9))
+    row = {"groups": {"K": "G"}, "probability": 0.9, "fault": "", "sure": 0.9, "since_us": 0, "said": ""}
+    change = {"parameter": "p_s", "ratio": 0.8, "interval": (0.7, 0.9)}
+    ill = [AssetSummary(asset=f"P{i}", day="D2", state="fault", before="healthy", **row, **change) for i in range(400)]
+    states = {f"P{i}": {"D1": "healthy", "D2": "fault"} for i in range(400)}
+    lost, names = (("P1", "D1", ""),), tuple(states)
+    fleet = Fleet(tuple(ill), (cause,) * 4, ("D1",) * 4, states, lost, {"G": ""}, {"P1": 5}, names)
+    terminal = io.StringIO()
+    pages = []
+    for shown in (fleet, Fleet((), (), (), {}, (), {}, {})):
+        print_fleet(Console(file=terminal, width=250), shown)
+        pages.append(render_fleet_page(shown, "L"))
+    text = terminal.getvalue() + re.sub("<style>.*?</style>|<[^>]*>", " ", "".join(pages), flags=re.S)
+    assert set(re.findall(r"[a-z]{3,}", outside_of_messages(text))) == set()
 
 
 def visible(page: str) -> str:

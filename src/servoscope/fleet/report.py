@@ -7,14 +7,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from servoscope.core.files import atomic_write, make_folder
-from servoscope.core.messages import count_words
+from servoscope.core.messages import Message, count_words, message, translate
 from servoscope.fleet.rows import MICRO
 from servoscope.fleet.summary import COMMON, FAILED, RATE, Fleet
 from servoscope.report.format_values import DASH, format_clock_time, format_count, format_size
-from servoscope.report.page import render_page, write_page
+from servoscope.report.page import render_page, say, write_page
 
 MAX_TABLE_ROWS = 300  # of a table: a page is read by people
-MAX_NAMES = 20  # in a sentence
+MAX_NAMES, MAX_CAUSES = 20, 3  # in a sentence
 MAX_DAYS = 60  # of the picture of days
 MIN_PROBABILITY_SHOWN = 0.05  # probability of a common cause that is worth its row
 MIN_EPOCH_S = 1e9  # s since 1970 from which a time is a date, not a time since some start
@@ -44,11 +44,14 @@ def render_fleet_page(fleet: Fleet, lake: str) -> str:
     return render_page(
         "fleet.html",
         package="servoscope.fleet",
-        title=f"Fleet: {lake}",
+        title=f"{translate('Fleet')}: {lake}",
         kind="fault" if fleet.accepted or fleet.count("fault") else "healthy",
         lake=lake,
         fleet=fleet,
-        items=sum(len(days) for days in fleet.states.values()),
+        facts=[
+            count_words(format_count(len(fleet.assets)), "asset"),
+            count_words(format_count(sum(map(len, fleet.states.values()))), "item"),
+        ],
         headline=headline(fleet),
         discoveries=describe_discoveries(fleet),
         counts=[(state, n) for state in states if (n := fleet.count(state)) or state == "healthy"],
@@ -71,25 +74,26 @@ def render_fleet_page(fleet: Fleet, lake: str) -> str:
 
 def headline(fleet: Fleet) -> str:
     """Return what there is to know first, as plain text."""
-    ill, shared = fleet.count("fault"), len(fleet.accepted)
-    parts = []
+    ill, shared = fleet.count("fault"), fleet.accepted
+    parts = list[Message | str]()
     if shared:
-        named = ", ".join(f"{cause.key} {cause.group}" for cause in fleet.accepted[:3])
-        parts.append(f"{shared} common cause{'s' * (shared > 1)} ({named}{', ...' * (shared > 3)})")
+        named = [f"{cause.key} {cause.group}" for cause in shared[:MAX_CAUSES]]
+        parts.append(message("fleet.shared", causes=len(shared), named=named, more=_more(len(shared) > MAX_CAUSES)))
     if ill:
-        parts.append(f"{count_words(ill, 'asset', 'en')} ill by {'themselves' if ill > 1 else 'itself'}")
-    return " and ".join(parts) if parts else "No asset has changed from its healthy baseline"
+        parts.append(count_words(ill, "ill_asset"))
+    return say("fleet.headline", parts=parts) if parts else say("fleet.unchanged")
 
 
 def describe_discoveries(fleet: Fleet) -> str:
     """Return which assets have changed at the false discovery rate, as plain text; empty where none has."""
     names = fleet.discovered
-    if not names:
-        return ""
-    listed = ", ".join(names[:MAX_NAMES]) + ", ..." * (len(names) > MAX_NAMES)
-    which = f"these {len(names)} have" if len(names) > 1 else "this one has"
-    of = f"Of {count_words(len(fleet.assets), 'asset', 'en')}, {which} changed: {listed}."
-    return f"{of} At most {RATE:.0%} of such names are wrong, on average."
+    shown, more = names[:MAX_NAMES], _more(len(names) > MAX_NAMES)
+    values = {"count": len(names), "assets": len(fleet.assets), "names": shown, "more": more, "rate": RATE}
+    return say("fleet.discovered", **values) if names else ""
+
+
+def _more(several: bool) -> Message | None:
+    return message("fleet.more_names") if several else None
 
 
 def _format_time(t_us: int | None) -> str:

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.text import Text
 
 from servoscope.cli.render.results import COLOURS, print_facts, print_notes, print_table
-from servoscope.core.messages import count_words
+from servoscope.core.messages import count_words, translate, translate_range
 from servoscope.core.number_format import format_ratios
 from servoscope.report.format_values import DASH, format_probability
 from servoscope.report.page import say
@@ -40,17 +40,25 @@ def print_fleet(out: Console, f: Fleet) -> None:
         for cause, since in shared:
             size, low, high = format_ratios(cause.ratio, *cause.interval)
             what = (f"{cause.key} {cause.group}", f"{len(cause.members)}", f"{cause.parameter} x {size}")
-            rows.append((*what, f"{low} to {high}", since or DASH, format_probability(cause.probability)))
+            rows.append(
+                (*what, translate_range(f"{low} to {high}"), since or DASH, format_probability(cause.probability))
+            )
         print_table(out, ("common cause", "assets", "change", "95 %", "since", "probability"), rows)
     ill = [asset for asset in f.assets if asset.state not in ("healthy", "failed")]
     if ill:
         own = [
-            (summary.asset, summary.day, summary.state, format_probability(summary.probability), summary.said)
+            (
+                summary.asset,
+                summary.day,
+                translate(summary.state),
+                format_probability(summary.probability),
+                summary.said,
+            )
             for summary in ill[:MAX_ASSETS_SHOWN]
         ]
         print_table(out, ("asset", "day", "state", "own", ""), own, words=5)
     if len(ill) > MAX_ASSETS_SHOWN:
         print_notes(out, [say("cli.more_ill", count=len(ill) - MAX_ASSETS_SHOWN)])
     lost = [f"{asset} {day}: {why}" for asset, day, why in f.failed]
-    lost += [f"{name}, not learned: {why}" for name, why in f.unlearned.items()]
+    lost += [say("fleet.unlearned", name=name, reason=why) for name, why in f.unlearned.items()]
     print_notes(out, lost[:MAX_ASSETS_SHOWN])
