@@ -18,10 +18,16 @@ expect = playwright.expect
 pytestmark = pytest.mark.slow
 
 
+def baseline_of(base: str, id_: str) -> str:
+    return str(asked(base, f"/diagnoses/{id_}")["baseline"]["hash"])
+
+
 def test_after_a_repair_an_asset_learns_again(chromium: Any, tmp_path: Path) -> None:
     config = repaired_axis(tmp_path)
     with screens.process("run", config.name, cwd=tmp_path), screens.serving(config) as base:
         until(lambda: asked(base, "/alarms")["alarms"])
+        before = {row["id"]: baseline_of(base, row["id"]) for row in asked(base, "/diagnoses?asset=axis")["diagnoses"]}
+        assert before and all(before.values())
         page = chromium.new_context(viewport=SIZE, locale="en-GB", timezone_id="UTC").new_page()
         page.goto(f"{base}/alarms")
         page.get_by_role("link", name="axis", exact=True).first.click()  # 1
@@ -40,6 +46,7 @@ def test_after_a_repair_an_asset_learns_again(chromium: Any, tmp_path: Path) -> 
         accessible(page)
         take.click()
         expect(part).to_contain_text("Baseline 2 is in force.")
+        assert [baseline_of(base, id_) for id_ in before] == list(before.values())  # and not the new one's
         until(lambda: asked(base, "/assets/axis")["verdict"] == "healthy")
         part.get_by_role("button", name="One step back").click()
         page.get_by_role("dialog").get_by_label("Why").fill("not run in")

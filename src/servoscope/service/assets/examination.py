@@ -188,10 +188,12 @@ def diagnose_blocks(baseline: Baseline, name: str, blocks: Sequence[Block]) -> S
     """
     from servoscope.diagnosis.diagnose import diagnose
     from servoscope.diagnosis.motion_signature import signature_columns
+    from servoscope.diagnosis.verify import provenance
 
     try:
         recording, start = blocks_to_recording(baseline, name, blocks)
         diagnosis = diagnose(baseline, recording)
+        diagnosis = diagnosis.model_copy(update={"provenance": provenance(baseline, recording)})
     except ServoscopeError as error:
         return undetermined("unusable", error=str(error))
     since = diagnosis.onset_s[1] if diagnosis.onset_s is not None else None

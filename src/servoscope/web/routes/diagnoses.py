@@ -105,8 +105,10 @@ def _asset_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
     )
     baseline = None
     if facts is not None and facts.model_fields_set:
-        # the baseline that the asset has now: the store does not know which one it had then
-        baseline = responses.BaselineRef(id=asset_baseline_id(context, asset), name=asset, hash=facts.baseline or "")
+        # of the diagnosis, which an asset that has learned again since no longer has
+        used = diagnosis.provenance if diagnosis is not None else None
+        known_hash = used.baseline if used is not None else facts.baseline or ""
+        baseline = responses.BaselineRef(id=asset_baseline_id(context, asset), name=asset, hash=known_hash)
     known = _asset_context(context, asset, diagnosis, facts)._replace(began=began, onset=rows[0]["onset"])
     return responses.DiagnosisDetail(
         **dict(responses.DiagnosisRow.from_stored(rows[0])),
