@@ -162,8 +162,6 @@ def test_the_monitor_says_the_same_block_by_block(warm: ss.Baseline, tmp_path: P
         assert monitor.latest(state).statistic[0] == pytest.approx(trace.statistic[-1], rel=1e-9)
     with pytest.raises(RecordingError, match="oil was not logged"):
         monitor.run(monitor.init(), *signals)
-    with pytest.raises(BaselineError, match="monitor of its own"):
-        ss.Monitor([warm, warm])
 
 
 def test_the_monitor_is_silent_outside_of_the_range(warm: ss.Baseline) -> None:

@@ -32,8 +32,8 @@ from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.estimation.window_features import MOTIONS, SIGNALS, FeatureLayout, Window
 
 PRIOR_DEGREES = 30.0  # degrees of freedom of the shape of S_w behind S
-SCORE_STD = 0.45  # of the logarithm of healthy scores, expected before any was seen: that of F with 12 and 30 degrees
-SCORE_PRIOR = 20.0  # degrees of freedom of that expectation
+SCORE_STD = 0.5  # of the logarithm of healthy scores, expected before any was seen
+SCORE_PRIOR = 8.0  # degrees of freedom of that expectation
 SCORE_POWER = 4.0  # in which the scores of groups are averaged
 MAX_SCORE_STDS = 1.345  # expected deviations of a logarithm from their mean; beyond, it counts as that (Huber, 1964)
 SCORE_CONSISTENCY = 1.41  # 1 over the share of a normal variance that this leaves

@@ -207,9 +207,12 @@ def _assemble_baseline(
 
 
 def _with_residuals(baseline: Baseline, healthy: HealthyRecordings) -> Baseline:
-    """Learn the residual, unless an exact plant leaves noise alone: the tests of the coefficients know its size."""
+    """Learn the residual, unless an exact plant leaves noise alone: the tests of the coefficients know its size.
+
+    That of an axis is scanned for changes sample by sample, and has its own scatter.
+    """
     exact = baseline.exact is not None and baseline.exact.misfit <= 1.0
-    if exact or healthy.loop.monitor.hidden_warm_up:
+    if exact or baseline.axis is not None or healthy.loop.monitor.hidden_warm_up:
         return baseline
     return baseline.model_copy(update={"residual": learn_residuals(healthy, np.array(baseline.theta))})
 

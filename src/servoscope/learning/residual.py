@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from servoscope.baseline.feature_model import score_limit
 from servoscope.baseline.residual_model import POSITIONS, SPEED_SHARES, ResidualLayout, ResidualModel
 from servoscope.core.arrays import FloatArray
+from servoscope.estimation.pipeline import Pipeline
 from servoscope.learning.features import PAST_BUDGET
 from servoscope.learning.recursion import HealthyRecordings
+from servoscope.signals import Recording
 
 MIN_RECORDINGS = 6  # so that five judge each: fewer do not tell a drift from scatter
+MAX_FOLDS = 8  # of recordings that are left out, some together where there are more
 TOP_SPEED_QUANTILE = 0.99  # of the speed of a recording
 SHIFT_MARGIN = 2.0  # of the limit: differences of halves scatter with heavier tails than features
 ACCELERATION_QUANTILES = (1.0 / 3.0, 2.0 / 3.0)  # braking, neither, accelerating
@@ -41,14 +46,27 @@ def learn_residuals(healthy: HealthyRecordings, theta: FloatArray) -> ResidualMo
         positions=tuple(np.linspace(y.min(), y.max(), POSITIONS + 1)[1:-1].tolist()),
         accelerations=tuple(np.quantile(a, ACCELERATION_QUANTILES).tolist()),
         covariates=names,
-    ).with_means(pipeline, recordings)
-    residuals = [layout.features(pipeline, rec) for rec in recordings]
-    others = [residuals[:i] + residuals[i + 1 :] for i in range(len(residuals))]
-    left_out = np.array(
-        [ResidualModel.of(layout, rest).ratios(one) for rest, one in zip(others, residuals, strict=True)]
     )
+    left_out = _left_out_ratios(layout, healthy)
     whole, shift = left_out[np.isfinite(left_out).all(axis=1)].T.tolist()
     if len(whole) < MIN_RECORDINGS:
         return None
     limits = score_limit(whole, share), SHIFT_MARGIN * score_limit(shift, PAST_BUDGET * share)
-    return ResidualModel.of(layout, residuals).model_copy(update={"limits": limits})
+    return _learn_model(layout, pipeline, recordings).model_copy(update={"limits": limits})
+
+
+def _learn_model(layout: ResidualLayout, pipeline: Pipeline, recordings: Sequence[Recording]) -> ResidualModel:
+    layout = layout.with_means(pipeline, recordings)
+    return ResidualModel.of(layout, [layout.features(pipeline, recording) for recording in recordings])
+
+
+def _left_out_ratios(layout: ResidualLayout, healthy: HealthyRecordings) -> FloatArray:
+    """Return the ratios of each recording, shape (n, 2), by means and scatter of recordings that do not hold it."""
+    recordings, pipeline = healthy.recordings, healthy.pipeline
+    fold = np.arange(len(recordings)) % MAX_FOLDS
+    ratios = np.empty((len(recordings), 2))
+    for k in range(min(MAX_FOLDS, len(recordings))):
+        model = _learn_model(layout, pipeline, [rec for rec, own in zip(recordings, fold, strict=True) if own != k])
+        for i in np.flatnonzero(fold == k).tolist():
+            ratios[i] = model.ratios_of(pipeline, recordings[i])
+    return ratios
