@@ -140,9 +140,9 @@ class TestWindows:
 
 class TestLimits:
     def test_the_limit_is_a_log_normal_prediction(self) -> None:
-        # logs 0, 1, 2: mean 1, deviations clipped to 1.345 x 0.45; with 20 degrees of 0.45^2; t_22(0.995) = 2.818756
-        variance = (1.41 * 2.0 * (1.345 * 0.45) ** 2 + 20.0 * 0.45**2) / 22.0
-        expected = np.exp(1.0 + 2.818756 * np.sqrt(variance * (1.0 + 1.0 / 3.0)))
+        # logs 0, 1, 2: mean 1, deviations clipped to 1.345 x 0.5; with 8 degrees of 0.5^2; t_10(0.995) = 3.169273
+        variance = (1.41 * 2.0 * (1.345 * 0.5) ** 2 + 8.0 * 0.5**2) / 10.0
+        expected = np.exp(1.0 + 3.169273 * np.sqrt(variance * (1.0 + 1.0 / 3.0)))
         assert score_limit(np.exp([0.0, 1.0, 2.0]), 0.005) == pytest.approx(expected, rel=1e-6)
 
     def test_one_outlier_raises_the_limit_to_its_own_score_and_no_further(self) -> None:
