@@ -32,8 +32,6 @@ from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.estimation.window_features import MOTIONS, SIGNALS, FeatureLayout, Window
 
 PRIOR_DEGREES = 30.0  # degrees of freedom of the shape of S_w behind S
-SCORE_STD = 0.5  # of the logarithm of healthy scores, expected before any was seen
-SCORE_PRIOR = 8.0  # degrees of freedom of that expectation
 SCORE_POWER = 4.0  # in which the scores of groups are averaged
 MAX_SCORE_STDS = 1.345  # expected deviations of a logarithm from their mean; beyond, it counts as that (Huber, 1964)
 SCORE_CONSISTENCY = 1.41  # 1 over the share of a normal variance that this leaves
@@ -46,6 +44,17 @@ MIN_WIDENING = 0.05  # and by how much at least: of a share of time, of a logari
 
 Vector = tuple[float, ...]
 Matrix = tuple[Vector, ...]
+
+
+class ScorePrior(NamedTuple):
+    """What is expected of the logarithms of healthy scores before any was seen."""
+
+    std: float
+    degrees: float  # of freedom
+
+
+WIDE_PRIOR = ScorePrior(0.5, 8.0)
+NARROW_PRIOR = ScorePrior(0.45, 20.0)  # that of F with 12 and 30 degrees: of features that no covariate moves
 
 
 class _FeatureRecord(BaseModel):
@@ -337,34 +346,28 @@ def _own_past(group: FeatureGroup, spans: Sequence[Sequence[SpanFeatures]]) -> F
     return past.model_copy(update={"means": to_tuples(means), "windows": worth})
 
 
-def score_limit(left_out: Sequence[float], false_alarms: float) -> float:
+def score_limit(left_out: Sequence[float], false_alarms: float, prior: ScorePrior = WIDE_PRIOR) -> float:
     """Return the score that a further healthy recording exceeds with a probability, by a log-normal distribution.
 
     Student's t for one more value beyond n, whose variance is shrunk to what is expected of such scores. A larger score
     among those left out is the limit instead.
     """
-    return max(robust_limit(left_out, false_alarms), *left_out)
+    return max(robust_limit(left_out, false_alarms, prior), *left_out)
 
 
-def robust_limit(left_out: Sequence[float], false_alarms: float) -> float:
+def robust_limit(left_out: Sequence[float], false_alarms: float, prior: ScorePrior = WIDE_PRIOR) -> float:
     """Return what `score_limit` does, without the largest score: one that exceeds it is an outlier."""
     from scipy import special
 
-    quantile = float(special.stdtrit(len(left_out) - 1.0 + SCORE_PRIOR, 1.0 - false_alarms))
-    return float(np.exp(_score_mean(left_out)[0] + quantile * score_std(left_out)))
+    n, degrees = len(left_out), len(left_out) - 1.0 + prior.degrees
+    mean, deviations = _robust_mean(np.log(np.maximum(left_out, MIN_SCORE)), MAX_SCORE_STDS * prior.std)
+    own = SCORE_CONSISTENCY * float((deviations**2).sum())
+    std = np.sqrt((own + prior.degrees * prior.std**2) / degrees * (1.0 + 1.0 / n))
+    return float(np.exp(mean + special.stdtrit(degrees, 1.0 - false_alarms) * std))
 
 
-def score_std(left_out: Sequence[float]) -> float:
-    """Return the standard deviation of the logarithm of a further healthy recording's score around their mean."""
-    n = len(left_out)
-    own = SCORE_CONSISTENCY * float((_score_mean(left_out)[1] ** 2).sum())
-    variance = (own + SCORE_PRIOR * SCORE_STD**2) / (n - 1.0 + SCORE_PRIOR)
-    return float(np.sqrt(variance * (1.0 + 1.0 / n)))
-
-
-def _score_mean(left_out: Sequence[float]) -> tuple[float, FloatArray]:
-    """Return the mean of the logarithms of scores, and their deviations from it; one far off counts as one less so."""
-    logs, most = np.log(np.maximum(left_out, MIN_SCORE)), MAX_SCORE_STDS * SCORE_STD
+def _robust_mean(logs: FloatArray, most: float) -> tuple[float, FloatArray]:
+    """Return the mean of logarithms of scores, and their deviations; one that is far off counts as one of `most`."""
     mean = float(np.median(logs))
     for _ in range(HUBER_ROUNDS):
         mean += float(np.clip(logs - mean, -most, most).mean())

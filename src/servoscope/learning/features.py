@@ -9,6 +9,8 @@ import numpy as np
 
 from servoscope.baseline.feature_model import (
     MIN_WIDENING,
+    NARROW_PRIOR,
+    WIDE_PRIOR,
     WIDENING_SHARE,
     FeatureModel,
     GroupStatistic,
@@ -77,6 +79,7 @@ def learn_features(loop: Loop, recordings: Sequence[Recording]) -> tuple[Feature
         left_out.append(now)
         past_left_out += [later] if any(statistic.group.past for statistic in statistics) else []
     compares_past = len(past_left_out) == len(spans)
+    prior = WIDE_PRIOR if names else NARROW_PRIOR
     groups = fit_groups(windows, spans, layout, conditions_of)
     model = FeatureModel(
         layout=layout,
@@ -84,13 +87,13 @@ def learn_features(loop: Loop, recordings: Sequence[Recording]) -> tuple[Feature
         motion_low=tuple(low),
         motion_high=tuple(high),
         left_out=tuple(left_out),
-        limit=score_limit(left_out, share),
+        limit=score_limit(left_out, share, prior),
         false_alarms=share,
         in_a_row=spans_in_a_row(layout, share, loop.monitor.false_alarms_per_year),
         covariates=names,
-        past_limit=score_limit(past_left_out, PAST_BUDGET * share) if compares_past else 0.0,
+        past_limit=score_limit(past_left_out, PAST_BUDGET * share, prior) if compares_past else 0.0,
     )
-    return model, _describe_outlier(recordings, left_out, robust_limit(left_out, share))
+    return model, _describe_outlier(recordings, left_out, robust_limit(left_out, share, prior))
 
 
 def _describe_outlier(recordings: Sequence[Recording], left_out: Sequence[float], limit: float) -> list[Message]:
