@@ -10,7 +10,7 @@ import numpy as np
 
 import servoscope as ss
 from public.simple_detectors import Scores, detectors, judge
-from servoscope.baseline.feature_model import score_std
+from servoscope.baseline.feature_model import NARROW_PRIOR, score_std
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -57,7 +57,11 @@ def servoscope_scores(loop: ss.Loop, healthy: Sequence[ss.Recording], judged: Se
     """
     baseline = ss.learn(loop, healthy)
     features = baseline.features
-    stds = {"features": score_std(features.left_out), "t2": score_std(baseline.scatter.left_out)} if features else {}
+    stds = (
+        {"features": score_std(features.left_out, NARROW_PRIOR), "t2": score_std(baseline.scatter.left_out)}
+        if features
+        else {}
+    )
     largest, order, names = [], [], []
     for recording in judged:
         diagnosis, trace = diagnose_with_trace(baseline, recording)

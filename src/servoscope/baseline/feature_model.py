@@ -359,15 +359,22 @@ def robust_limit(left_out: Sequence[float], false_alarms: float, prior: ScorePri
     """Return what `score_limit` does, without the largest score: one that exceeds it is an outlier."""
     from scipy import special
 
-    n, degrees = len(left_out), len(left_out) - 1.0 + prior.degrees
-    mean, deviations = _robust_mean(np.log(np.maximum(left_out, MIN_SCORE)), MAX_SCORE_STDS * prior.std)
-    own = SCORE_CONSISTENCY * float((deviations**2).sum())
-    std = np.sqrt((own + prior.degrees * prior.std**2) / degrees * (1.0 + 1.0 / n))
-    return float(np.exp(mean + special.stdtrit(degrees, 1.0 - false_alarms) * std))
+    mean, _ = _robust_mean(left_out, prior)
+    quantile = float(special.stdtrit(len(left_out) - 1.0 + prior.degrees, 1.0 - false_alarms))
+    return float(np.exp(mean + quantile * score_std(left_out, prior)))
 
 
-def _robust_mean(logs: FloatArray, most: float) -> tuple[float, FloatArray]:
-    """Return the mean of logarithms of scores, and their deviations; one that is far off counts as one of `most`."""
+def score_std(left_out: Sequence[float], prior: ScorePrior = WIDE_PRIOR) -> float:
+    """Return the standard deviation of the logarithm of a further healthy recording's score around their mean."""
+    n = len(left_out)
+    own = SCORE_CONSISTENCY * float((_robust_mean(left_out, prior)[1] ** 2).sum())
+    variance = (own + prior.degrees * prior.std**2) / (n - 1.0 + prior.degrees)
+    return float(np.sqrt(variance * (1.0 + 1.0 / n)))
+
+
+def _robust_mean(left_out: Sequence[float], prior: ScorePrior) -> tuple[float, FloatArray]:
+    """Return the mean of the logarithms of scores, and their deviations from it; one far off counts as one less so."""
+    logs, most = np.log(np.maximum(left_out, MIN_SCORE)), MAX_SCORE_STDS * prior.std
     mean = float(np.median(logs))
     for _ in range(HUBER_ROUNDS):
         mean += float(np.clip(logs - mean, -most, most).mean())
