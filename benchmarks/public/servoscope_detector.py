@@ -10,7 +10,7 @@ import numpy as np
 
 import servoscope as ss
 from public.simple_detectors import Scores, detectors, judge
-from servoscope.baseline.feature_model import NARROW_PRIOR, score_std
+from servoscope.baseline.threshold import NARROW_PRIOR, score_std
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -20,11 +20,10 @@ from servoscope.baseline.feature_model import (
     FeatureModel,
     FeatureName,
     GroupStatistic,
-    robust_limit,
-    score_limit,
     spans_in_a_row,
 )
 from servoscope.baseline.feature_spans import SpanFeatures
+from servoscope.baseline.threshold import robust_limit, score_limit
 from servoscope.detection.feature_monitor import hold, smallest_in_a_row
 from servoscope.detection.homogeneity import leave_one_out, scatter, scatter_of_others
 from servoscope.detection.statistic import t2_statistic

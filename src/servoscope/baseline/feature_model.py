@@ -33,10 +33,6 @@ from servoscope.estimation.window_features import MOTIONS, SIGNALS, FeatureLayou
 
 PRIOR_DEGREES = 30.0  # degrees of freedom of the shape of S_w behind S
 SCORE_POWER = 4.0  # in which the scores of groups are averaged
-MAX_SCORE_STDS = 1.345  # expected deviations of a logarithm from their mean; beyond, it counts as that (Huber, 1964)
-SCORE_CONSISTENCY = 1.41  # 1 over the share of a normal variance that this leaves
-MIN_SCORE = 1e-9  # of which a logarithm is taken
-HUBER_ROUNDS = 30  # after which the mean does not move any more
 # of the learned range, by which a covariate may be outside of it: the limit widens with the distance
 MAX_EXTRAPOLATION_SHARE = 0.2
 WIDENING_SHARE = 0.5  # share by which the healthy range of motion is widened either way
@@ -44,17 +40,6 @@ MIN_WIDENING = 0.05  # and by how much at least: of a share of time, of a logari
 
 Vector = tuple[float, ...]
 Matrix = tuple[Vector, ...]
-
-
-class ScorePrior(NamedTuple):
-    """What is expected of the logarithms of healthy scores before any was seen."""
-
-    std: float
-    degrees: float  # of freedom
-
-
-WIDE_PRIOR = ScorePrior(0.5, 8.0)
-NARROW_PRIOR = ScorePrior(0.45, 20.0)  # that of F with 12 and 30 degrees: of features that no covariate moves
 
 
 class _FeatureRecord(BaseModel):
@@ -344,41 +329,6 @@ def _own_past(group: FeatureGroup, spans: Sequence[Sequence[SpanFeatures]]) -> F
     if not np.isfinite(means).all() or not worth > 0.0:
         return None
     return past.model_copy(update={"means": to_tuples(means), "windows": worth})
-
-
-def score_limit(left_out: Sequence[float], false_alarms: float, prior: ScorePrior = WIDE_PRIOR) -> float:
-    """Return the score that a further healthy recording exceeds with a probability, by a log-normal distribution.
-
-    Student's t for one more value beyond n, whose variance is shrunk to what is expected of such scores. A larger score
-    among those left out is the limit instead.
-    """
-    return max(robust_limit(left_out, false_alarms, prior), *left_out)
-
-
-def robust_limit(left_out: Sequence[float], false_alarms: float, prior: ScorePrior = WIDE_PRIOR) -> float:
-    """Return what `score_limit` does, without the largest score: one that exceeds it is an outlier."""
-    from scipy import special
-
-    mean, _ = _robust_mean(left_out, prior)
-    quantile = float(special.stdtrit(len(left_out) - 1.0 + prior.degrees, 1.0 - false_alarms))
-    return float(np.exp(mean + quantile * score_std(left_out, prior)))
-
-
-def score_std(left_out: Sequence[float], prior: ScorePrior = WIDE_PRIOR) -> float:
-    """Return the standard deviation of the logarithm of a further healthy recording's score around their mean."""
-    n = len(left_out)
-    own = SCORE_CONSISTENCY * float((_robust_mean(left_out, prior)[1] ** 2).sum())
-    variance = (own + prior.degrees * prior.std**2) / (n - 1.0 + prior.degrees)
-    return float(np.sqrt(variance * (1.0 + 1.0 / n)))
-
-
-def _robust_mean(left_out: Sequence[float], prior: ScorePrior) -> tuple[float, FloatArray]:
-    """Return the mean of the logarithms of scores, and their deviations from it; one far off counts as one less so."""
-    logs, most = np.log(np.maximum(left_out, MIN_SCORE)), MAX_SCORE_STDS * prior.std
-    mean = float(np.median(logs))
-    for _ in range(HUBER_ROUNDS):
-        mean += float(np.clip(logs - mean, -most, most).mean())
-    return mean, np.clip(logs - mean, -most, most)
 
 
 def spans_in_a_row(layout: FeatureLayout, false_alarms: float, false_alarms_per_year: float) -> int:

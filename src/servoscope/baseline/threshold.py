@@ -1,11 +1,20 @@
-"""The threshold of T^2 and the shares of the tests in the budget of false alarms."""
+"""The thresholds of T^2 and of scores, and the shares of the tests in the budget of false alarms."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
 from servoscope.models.loop import Loop
 
+MAX_SCORE_STDS = 1.345  # expected deviations of a logarithm from their mean; beyond, it counts as that (Huber, 1964)
+SCORE_CONSISTENCY = 1.41  # 1 over the share of a normal variance that this leaves
+MIN_SCORE = 1e-9  # of which a logarithm is taken
+HUBER_ROUNDS = 30  # after which the mean does not move any more
 SECONDS_PER_YEAR = 365.25 * 86400.0
 FEATURE_SHARE = 0.1  # of the budget of false alarms, where there are features
 SEQUENTIAL_SHARE = 0.5  # of the budget of false alarms, where there is a sequential test
@@ -58,3 +67,49 @@ def t2_threshold(
     share = 1.0 - (SEQUENTIAL_SHARE if sequential else 0.0) - (FEATURE_SHARE if features else 0.0)
     budget = monitor.false_alarms_per_year * share
     return threshold(n, monitor.evaluation_rate, monitor.memory, budget, dof, calibration.statistic)
+
+
+class ScorePrior(NamedTuple):
+    """What is expected of the logarithms of healthy scores before any was seen."""
+
+    std: float
+    degrees: float  # of freedom
+
+
+WIDE_PRIOR = ScorePrior(0.5, 8.0)
+NARROW_PRIOR = ScorePrior(0.45, 20.0)  # that of F with 12 and 30 degrees: of features that no covariate moves
+
+
+def score_limit(left_out: Sequence[float], false_alarms: float, prior: ScorePrior = WIDE_PRIOR) -> float:
+    """Return the score that a further healthy recording exceeds with a probability, by a log-normal distribution.
+
+    Student's t for one more value beyond n, whose variance is shrunk to what is expected of such scores. A larger score
+    among those left out is the limit instead.
+    """
+    return max(robust_limit(left_out, false_alarms, prior), *left_out)
+
+
+def robust_limit(left_out: Sequence[float], false_alarms: float, prior: ScorePrior = WIDE_PRIOR) -> float:
+    """Return what `score_limit` does, without the largest score: one that exceeds it is an outlier."""
+    from scipy import special
+
+    mean, _ = _robust_mean(left_out, prior)
+    quantile = float(special.stdtrit(len(left_out) - 1.0 + prior.degrees, 1.0 - false_alarms))
+    return float(np.exp(mean + quantile * score_std(left_out, prior)))
+
+
+def score_std(left_out: Sequence[float], prior: ScorePrior = WIDE_PRIOR) -> float:
+    """Return the standard deviation of the logarithm of a further healthy recording's score around their mean."""
+    n = len(left_out)
+    own = SCORE_CONSISTENCY * float((_robust_mean(left_out, prior)[1] ** 2).sum())
+    variance = (own + prior.degrees * prior.std**2) / (n - 1.0 + prior.degrees)
+    return float(np.sqrt(variance * (1.0 + 1.0 / n)))
+
+
+def _robust_mean(left_out: Sequence[float], prior: ScorePrior) -> tuple[float, FloatArray]:
+    """Return the mean of the logarithms of scores, and their deviations from it; one far off counts as one less so."""
+    logs, most = np.log(np.maximum(left_out, MIN_SCORE)), MAX_SCORE_STDS * prior.std
+    mean = float(np.median(logs))
+    for _ in range(HUBER_ROUNDS):
+        mean += float(np.clip(logs - mean, -most, most).mean())
+    return mean, np.clip(logs - mean, -most, most)

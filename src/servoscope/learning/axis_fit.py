@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servoscope.baseline.axis_model import AxisModel, AxisMoves
-from servoscope.baseline.feature_model import score_limit
+from servoscope.baseline.threshold import score_limit
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError
 from servoscope.core.messages import Message, message

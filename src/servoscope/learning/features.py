@@ -9,18 +9,15 @@ import numpy as np
 
 from servoscope.baseline.feature_model import (
     MIN_WIDENING,
-    NARROW_PRIOR,
-    WIDE_PRIOR,
     WIDENING_SHARE,
     FeatureModel,
     GroupStatistic,
     fit_groups,
-    robust_limit,
-    score_limit,
     span_scores,
     spans_in_a_row,
 )
 from servoscope.baseline.feature_spans import SpanFeatures
+from servoscope.baseline.threshold import NARROW_PRIOR, WIDE_PRIOR, robust_limit, score_limit
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.core.messages import Message, message

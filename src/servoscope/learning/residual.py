@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from servoscope.baseline.feature_model import score_limit
 from servoscope.baseline.residual_model import POSITIONS, SPEED_SHARES, ResidualLayout, ResidualModel
+from servoscope.baseline.threshold import score_limit
 from servoscope.core.arrays import FloatArray
 from servoscope.estimation.pipeline import Pipeline
 from servoscope.learning.features import PAST_BUDGET
