@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import screens
 from opening import SIZE, THEMES, Open, accessible, diagnosis_of, drag, painted, shot, tab_to
-from screens import asked
+from screens import asked, until
 
 from servoscope.prognosis.series import read_sizes
 
@@ -83,7 +83,9 @@ def test_an_asset_says_what_is_wrong_how_much_and_since_when(open_page: Open) ->
     page = open_page("/assets/press-1")
     verdict = page.get_by_role("region", name="Verdict")
     expect(verdict).to_contain_text(re.compile(r"Fault: leakage has risen by.*Cie \+(19|20)"))
-    assert verdict.get_by_role("listitem").first.bounding_box()["y"] < SIZE["height"] / 2  # without a click or a scroll
+    check = verdict.get_by_role("listitem").first
+    # without a click or a scroll; there is no box while the page draws it anew
+    until(lambda: (box := check.bounding_box()) is not None and box["y"] < SIZE["height"] / 2)
     expect(page.get_by_text("Statistic T²")).to_be_hidden()
     page.get_by_text("For experts").click()
     expect(page.get_by_role("img", name=re.compile("complex plane"))).to_have_count(3)
