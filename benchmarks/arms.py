@@ -30,7 +30,13 @@ from servoscope.models.arm.dynamics import torque_regressor
 from servoscope.models.arm.settings import ArmLoop
 from servoscope.models.arm.urdf import parse_urdf
 from servoscope.signals.readers.arm_log import ArmRecording, read_arm_log
-from servoscope.simulation.arm import GAINS, SIGN_SPEED, URDF, ArmChange, simulate_arm, simulated_arm
+from servoscope.simulation.arm import (
+    URDF,
+    ArmChange,
+    simulate_arm,
+    simulated_arm,
+    simulated_arm_loop,
+)
 
 UR_GAINS = (14.87, 13.26, 11.13, 10.62, 11.03, 11.47)  # N m/A, De Luca's
 LEARNED_DAYS = ("20_02_05", "20_02_06", "20_02_10")
@@ -268,12 +274,7 @@ def floor(baseline: ArmBaseline, recording: ArmRecording) -> np.ndarray:
 
 def simulated(count: int) -> tuple[Table, dict[str, str]]:
     """Judge simulated recordings, `count` of each kind of change and five times as many healthy ones."""
-    arm, urdf = simulated_arm(), URDF.read_text(encoding="utf-8")
-    joints = {
-        name: {"position": f"q{j + 1}", "torque": f"i{j + 1}", "gain": GAINS[j]} for j, name in enumerate(arm.names)
-    }
-    table = {"kind": "arm", "urdf": "x", "sample_rate": 100.0, "sign_speed": SIGN_SPEED, "joints": joints}
-    loop = ArmLoop.from_dict(table, "arm.toml")
+    arm, urdf, loop = simulated_arm(), URDF.read_text(encoding="utf-8"), simulated_arm_loop()
 
     def record(seed: int, change: ArmChange | None = None) -> ArmRecording:
         return read_arm_log(simulate_arm(seed, SIMULATED_S, change), loop, arm)
@@ -347,11 +348,7 @@ def speed() -> tuple[Table, dict[str, str]]:
     begin = time.process_time()
     torque_regressor(arm, q, v, a)
     regressor = time.process_time() - begin
-    joints = {
-        name: {"position": f"q{j + 1}", "torque": f"i{j + 1}", "gain": GAINS[j]} for j, name in enumerate(arm.names)
-    }
-    table = {"kind": "arm", "urdf": "x", "sample_rate": 100.0, "sign_speed": SIGN_SPEED, "joints": joints}
-    loop = ArmLoop.from_dict(table, "arm.toml")
+    loop = simulated_arm_loop()
     recordings = [read_arm_log(simulate_arm(seed, 60.0), loop, arm) for seed in range(4)]
     baseline = learn_arm(loop, URDF.read_text(encoding="utf-8"), recordings[:3])
     diagnose_arm(baseline, recordings[0])

@@ -24,7 +24,14 @@ from servoscope.models.arm.settings import ArmLoop
 from servoscope.models.arm.urdf import parse_urdf
 from servoscope.report.arm_page import render_arm_page
 from servoscope.signals.readers.arm_log import ArmRecording, read_arm_log
-from servoscope.simulation.arm import GAINS, SIGN_SPEED, URDF, ArmChange, simulate_arm, simulated_arm
+from servoscope.simulation.arm import (
+    GAINS,
+    URDF,
+    ArmChange,
+    simulate_arm,
+    simulated_arm,
+    simulated_arm_loop,
+)
 
 UR_GAINS = (14.87, 13.26, 11.13, 10.62, 11.03, 11.47)
 UR_DAYS = ("20_02_05", "20_02_06", "20_02_10")
@@ -45,12 +52,7 @@ Read = Callable[[int, ArmChange | None], ArmRecording]
 
 @pytest.fixture(scope="module")
 def simulated() -> tuple[ArmBaseline, Read]:
-    arm, urdf = simulated_arm(), URDF.read_text(encoding="utf-8")
-    joints = {
-        name: {"position": f"q{j + 1}", "torque": f"i{j + 1}", "gain": GAINS[j]} for j, name in enumerate(arm.names)
-    }
-    table = {"kind": "arm", "urdf": "x", "sample_rate": 100.0, "sign_speed": SIGN_SPEED, "joints": joints}
-    loop = ArmLoop.from_dict(table, "arm.toml")
+    arm, urdf, loop = simulated_arm(), URDF.read_text(encoding="utf-8"), simulated_arm_loop()
 
     def record(seed: int, change: ArmChange | None = None) -> ArmRecording:
         return read_arm_log(simulate_arm(seed, 30.0, change), loop, arm)

@@ -44,7 +44,10 @@ class CausePosterior:
     discriminant: StictionDiscriminant
 
     def probabilities(self, features: FloatArray, *, process: bool = False) -> FloatArray:
-        """Return the probability of each cause, shape (N, causes), for features of shape (N, F) of process loops."""
+        """Return the probability of each cause, shape (N, causes), for features of shape (N, F).
+
+        `process`: whether the logs are of process loops.
+        """
         logits = expand_features(features, self.mean, self.std) @ self.weights
         if process:
             others, d = special.logsumexp(logits[:, 1:], axis=1), self.discriminant  # stiction is the first cause

@@ -149,21 +149,20 @@ class ResidualModel(BaselineModel):
     @classmethod
     def of(cls, layout: ResidualLayout, healthy: Sequence[RecordingResidual]) -> Self:
         """Describe healthy recordings, without limits."""
-        values, c = np.array([one.features[0] for one in healthy]), np.array([one.covariates[0] for one in healthy])
-        shifts, least = (
-            np.array([one.shift for one in healthy]),
-            (MIN_SHARE * float(np.mean([one.size for one in healthy]))) ** 2,
-        )
+        values = np.array([residual.features[0] for residual in healthy])
+        c = np.array([residual.covariates[0] for residual in healthy])
+        shifts = np.array([residual.shift for residual in healthy])
+        least = (MIN_SHARE * float(np.mean([residual.size for residual in healthy]))) ** 2
         X = np.column_stack([np.ones(len(c)), c])
         left = values - X @ (np.linalg.pinv(X) @ values)
         whole = _group(values, 0.5 * np.cov(shifts.T), left.var(axis=0, ddof=X.shape[1]), least, 2.0, c)
         statistic = GroupStatistic.of(whole, drift=False)
-        shifts -= [_expected_shift(statistic, one) for one in healthy]
+        shifts -= [_expected_shift(statistic, residual) for residual in healthy]
         W = np.cov(shifts.T)
         return cls(
             layout=layout,
-            motions=to_tuples(np.array([one.motion for one in healthy])),
-            samples=float(np.mean([one.samples for one in healthy])),
+            motions=to_tuples(np.array([residual.motion for residual in healthy])),
+            samples=float(np.mean([residual.samples for residual in healthy])),
             groups=(whole, _group(shifts, W, np.diag(W), least, 1.0, c[:, :0])),
         )
 

@@ -88,9 +88,11 @@ def isolate(
         for fit, share in zip(fitted, probability[:-1], strict=True)
     ]
     # a size that may be healthy is no explanation of a change
-    named = [c for c in candidates if not any(fault.may_be_healthy for fault in c.faults)]
-    unnamed = [c.model_copy(update={"probability": 0.0}) for c in candidates if c not in named]
-    unknown_share = float(probability[-1]) + sum(c.probability for c in candidates if c not in named)
+    named, unnamed = list[Candidate](), list[Candidate]()
+    for candidate in candidates:
+        (unnamed if any(fault.may_be_healthy for fault in candidate.faults) else named).append(candidate)
+    unknown_share = float(probability[-1]) + sum(c.probability for c in unnamed)
+    unnamed = [c.model_copy(update={"probability": 0.0}) for c in unnamed]
     candidates = [*named, *unnamed, Candidate(name=UNKNOWN, probability=unknown_share)]
     return tuple(sorted(candidates, key=lambda candidate: -candidate.probability))
 

@@ -12,6 +12,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
 from servoscope.core.files import atomic_write
 from servoscope.models.arm.dynamics import torque_regressor
+from servoscope.models.arm.settings import ArmLoop
 from servoscope.models.arm.urdf import Kinematics, parse_urdf
 
 URDF = files("servoscope.simulation").joinpath("six_joints.urdf")
@@ -53,6 +54,17 @@ class ArmChange:
 def simulated_arm() -> Kinematics:
     """Return the arm."""
     return parse_urdf(URDF.read_text(encoding="utf-8"), "six_joints.urdf")
+
+
+def simulated_arm_loop() -> ArmLoop:
+    """Return the loop whose logs `simulate_arm` returns."""
+    joints = {
+        name: {"position": f"q{j + 1}", "torque": f"i{j + 1}", "gain": GAINS[j]}
+        for j, name in enumerate(simulated_arm().names)
+    }
+    rate = RATE / LOG_EVERY
+    table = {"kind": "arm", "urdf": URDF.name, "sample_rate": rate, "sign_speed": SIGN_SPEED, "joints": joints}
+    return ArmLoop.from_dict(table, "arm.toml")
 
 
 def simulate_arm(seed: int, duration_s: float = 60.0, change: ArmChange | None = None) -> dict[str, FloatArray]:
