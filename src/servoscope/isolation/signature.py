@@ -40,6 +40,10 @@ def parameter_signature(fault: Fault, shift_of_ratio: Callable[[float], FloatArr
 
 
 def coefficient_signature(fault: Fault, direction: FloatArray) -> Signature:
-    """Return the signature of a coefficient: theta moves along `direction`, its value of today, either way."""
+    """Return the signature of a coefficient: theta moves along `direction`, its value of today, either way.
+
+    A fault whose ratios begin at 1 only grows.
+    """
     reach = max(fault.ratio_range[1] - 1.0, 1.0)
-    return Signature(fault, lambda x: x * direction, lambda x: 1.0 + x, -reach, reach)
+    low = -reach if fault.ratio_range[0] < 1.0 else 0.0
+    return Signature(fault, lambda x: x * direction, lambda x: 1.0 + x, low, reach)

@@ -67,13 +67,16 @@ def _plant_signatures(
     names = dict.fromkeys([*plant.parameters, *(name for ray in plant.rays for name in ray.exponents)])
     directions = fault_directions(baseline.loop, plant, np.array(baseline.theta), [*names])
     moving = [fault for fault in plant.faults if np.any(directions[fault.parameter])]
+    healthy = dict(zip(baseline.names, baseline.theta, strict=True))
+    powers = [plant.exponents(fault.parameter, healthy) for fault in moving]
     single = [
         coefficient_signature(fault, learned @ directions[fault.parameter])
-        if {*plant.exponents(fault.parameter).values()} <= {1.0}
-        else parameter_signature(fault, _power_shift(baseline, plant.exponents(fault.parameter), learned))
-        for fault in moving
+        if {*each.values()} <= {1.0}
+        else parameter_signature(fault, _power_shift(baseline, each, learned))
+        for fault, each in zip(moving, powers, strict=True)
     ]
-    single = [replace(signature, angle=plant.ray_angles.get(signature.fault.parameter, 0.0)) for signature in single]
+    angles, errors = ([known.get(f.parameter, 0.0) for f in moving] for known in (plant.ray_angles, plant.size_errors))
+    single = [replace(s, angle=a, healthy_std=e) for s, a, e in zip(single, angles, errors, strict=True)]
     return single + [
         _ray_signature(ray, learned, directions, _healthy_std(baseline, ray.full[0][0])) for ray in plant.rays
     ]
