@@ -13,6 +13,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError, RecordingError
 from servoscope.detection.onset import Onset
 from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.pressure_evidence import pressure_inputs
 from servoscope.estimation.instrumental_fit import InstrumentalFit, fit_with_instrument
 from servoscope.estimation.tuning import fit_tuning, least_squares
 from servoscope.isolation.signature import Signature
@@ -102,6 +103,8 @@ def isolation_inputs(exam: Examination, onset: Onset, at: int) -> tuple[list[Sig
     recursive = e.theta[at] - exam.expected[at], e.S[at] * max(1.0, float(e.power[at])) + known
     if whole is not None:
         whole = whole[0], whole[1] + known
+    elif exam.pressure_sums is not None:
+        return pressure_inputs(exam, onset)
     elif (model := exam.baseline.residual) is not None and model.halves:
         whole = _deviation_of_stretch(exam, model, onset, last)
     deviation, covariance = whole or recursive

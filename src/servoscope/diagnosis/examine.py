@@ -20,6 +20,7 @@ from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.covariates import CovariatePath
 from servoscope.baseline.expectation import Expectation, ReferencePath, reference_path, residual_noise_model
 from servoscope.baseline.motion import RecordedMotion
+from servoscope.baseline.pressure_model import Sums
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import RecordingError
@@ -91,7 +92,7 @@ class Examination:
             place = ", ".join(filter(None, [baseline.point, along.place]))
             # features are compared at the covariates of each span, and an axis at those of each sample
             moves = baseline.axis is not None and baseline.axis.moves is not None
-            kept = "features", "residual", *(["axis"] if moves else [])
+            kept = "features", "residual", "pressures", *(["axis"] if moves else [])
             followed: dict[str, Any] = {"point": place, **{name: getattr(baseline, name) for name in kept}}
             baseline = baseline.at(dict(zip(model.names, along.averages[-1].tolist(), strict=True)))
             baseline = baseline.model_copy(update=followed)
@@ -167,6 +168,20 @@ class Examination:
         model = None if self.quick else self.baseline.residual
         return np.full(2, np.nan) if model is None else model.ratios_of(self.pipeline, self.recording)
 
+    @cached_property
+    def pressure_sums(self) -> Sums | None:
+        """What logged pressures show, piece by piece; None where none were learned or logged, or it is `quick`."""
+        model = self.baseline.pressures
+        if model is None or self.quick or not model.is_logged(self.recording):
+            return None
+        return model.layout.sums(self.recording)
+
+    @cached_property
+    def pressure_ratios(self) -> FloatArray:
+        """Deviations of the pressures over their limits, see `PressureModel.ratios`; NaN: no evidence."""
+        model, sums = self.baseline.pressures, self.pressure_sums
+        return np.full(2, np.nan) if model is None or sums is None else model.ratios(sums)
+
     @property
     def features_changed_s(self) -> float | None:
         """End of the span with which the features left their limit [s]; None where they did not."""
@@ -183,7 +198,8 @@ class Examination:
         """Whether a change within the recording had been detected, or was not yet repaired, shape (K,)."""
         change, index = self.change, self.estimates.index
         if change is None:  # what is left of u speaks of the whole recording
-            return np.asarray((index == index[-1:].sum()) & (self.residual_ratios > 1.0).any())
+            ratios = np.append(self.residual_ratios, self.pressure_ratios)
+            return np.asarray((index == index[-1:].sum()) & (ratios > 1.0).any())
         if change.repaired:
             return np.asarray(index < change.onset)
         return np.asarray(index >= index[-1:].min(initial=change.detected))  # or detected after the last evaluation

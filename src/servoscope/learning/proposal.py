@@ -22,6 +22,7 @@ from servoscope.learning.inspection import Inspection, inspect
 from servoscope.learning.inspection.rules import advised_rest_speed
 from servoscope.learning.plant_choice import PlantCandidate, choose_plant
 from servoscope.models.loop import Columns, Loop, MonitorSettings
+from servoscope.models.plants.cylinder import CylinderPlant
 from servoscope.signals import Recording
 from servoscope.signals.readers import ChannelInfo, list_channels, read
 from servoscope.signals.readers.axes import find_axes, signal_names
@@ -30,6 +31,7 @@ from servoscope.signals.readers.formats import open_file
 from servoscope.signals.readers.guess_columns import (
     FIELDS,
     guess_mapping,
+    guess_pressures,
     mapping_template,
     names_speed,
     names_target_torque,
@@ -175,6 +177,11 @@ def propose_loop(paths: Sequence[Path], columns: Columns, where: Mapping[str, st
         raise RecordingError(f"{path}: {error}") from None
     chosen = candidates[0]
     loop = loop_of(chosen.settings)
+    if isinstance(loop.plant, CylinderPlant):
+        pressures = guess_pressures([channel.name for channel in list_channels(path, columns.text)])
+        if pressures is not None:
+            chosen = replace(chosen, settings={**chosen.settings, "pressures": pressures})
+            loop = loop_of(chosen.settings)
     held = []
     if (speed := advised_rest_speed(inspect(recording, loop), loop)) is not None:
         speed = float(f"{speed:.2g}")
@@ -228,7 +235,10 @@ def _plant_lines(chosen: PlantCandidate) -> list[ProposalLine]:
     lines = []
     for key, value in chosen.settings.items():
         why = explained if key == "kind" else message(f"init.of_{key}")
-        lines.append(ProposalLine("plant", key, json.dumps(value), why, key == "kind" and share < MIN_CLEAR_SHARE))
+        written = json.dumps(value, ensure_ascii=False)
+        if isinstance(value, Mapping):
+            written = f"{{{', '.join(f'{name} = {_quoted(text)}' for name, text in value.items())}}}"
+        lines.append(ProposalLine("plant", key, written, why, key == "kind" and share < MIN_CLEAR_SHARE))
     return lines
 
 

@@ -59,16 +59,20 @@ def learn_residuals(healthy: HealthyRecordings, theta: FloatArray) -> ResidualMo
 
 
 def _half_covariance(healthy: HealthyRecordings, theta: FloatArray) -> FloatArray:
-    """Return the covariance (n, n) of a further fit to half a recording, about coefficients theta (n,).
+    """Return the covariance (n, n) of a further fit to half a recording, about coefficients theta (n,)."""
+    halves = [half for g in healthy.regressions for half in g.halves if half.ok.sum() > len(theta)]
+    left = np.array([least_squares(half) for half in halves]) - theta
+    return further_covariance(left, len(healthy.recordings))
+
+
+def further_covariance(left: FloatArray, recordings: int) -> FloatArray:
+    """Return the covariance (n, n) of a further fit from what fits of so many recordings are off by, shape (m, n).
 
     Of few fits, correlations count the less, as if as many fits without any as there are coefficients had been seen.
     """
-    halves = [half for g in healthy.regressions for half in g.halves if half.ok.sum() > len(theta)]
-    left = np.array([least_squares(half) for half in halves]) - theta
-    size = np.sqrt((left**2).mean(axis=0))
-    correlations = left.T @ left / np.outer(size, size) + len(theta) * np.eye(len(theta))
-    factor = prediction_factor(len(healthy.recordings))
-    return np.asarray(factor * correlations / (len(left) + len(theta)) * np.outer(size, size))
+    size, n = np.sqrt((left**2).mean(axis=0)), left.shape[1]
+    correlations = left.T @ left / np.outer(size, size) + n * np.eye(n)
+    return np.asarray(prediction_factor(recordings) * correlations / (len(left) + n) * np.outer(size, size))
 
 
 def _learn_model(layout: ResidualLayout, pipeline: Pipeline, recordings: Sequence[Recording]) -> ResidualModel:

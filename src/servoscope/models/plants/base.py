@@ -126,6 +126,11 @@ class Plant(BaseModel, abc.ABC):
         """Powers of s of the linear columns; the first ``len(powers)`` coefficients belong to them."""
 
     @property
+    def channels(self) -> Mapping[str, str]:
+        """Columns of a log that it takes besides r, u and y, by the name that they have in a recording."""
+        return {}
+
+    @property
     def derivative(self) -> int:
         """The power of s by which y is ahead of a position: 1 where it is a speed."""
         return 0

@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from servoscope.core.errors import LoopError
+from servoscope.core.settings import NonEmptyStr, Settings
 from servoscope.models.plants.base import Fault, StateSpace, read_translations
 from servoscope.models.plants.columns import Column
 from servoscope.models.plants.terms import TERM_TUPLE, UNIQUE_TERMS, TermColumn, TermPlant
@@ -16,6 +17,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 TermName = Literal["jerk", "spring", "process", "droop", "overlap", "leakage", "offset"]
 
+CHANNELS = "p_A", "p_B", "p_S"  # of logged pressures, in a recording
 BY_DIRECTION = "velocity_forward", "velocity_backward"
 ACCELERATION = TermColumn("acceleration", 2, 1, signed=True)
 # term -> its column; the velocity by direction, for two areas, and the acceleration are part of every cylinder
@@ -99,6 +101,14 @@ FAULTS: dict[str, tuple[str, tuple[float, float], str, str]] = {
 }
 
 
+class Pressures(Settings):
+    """Columns of logged pressures, all three in one unit."""
+
+    A: NonEmptyStr
+    B: NonEmptyStr
+    supply: NonEmptyStr
+
+
 class CylinderPlant(TermPlant):
     """Cylinder ``input_gain u = c_forward max(y', 0) + c_backward min(y', 0) + acceleration y'' + sum of terms``.
 
@@ -127,6 +137,8 @@ class CylinderPlant(TermPlant):
     )
     # output beyond which the force of the term ``process`` acts
     contact: Finite | None = None
+    # columns of the pressures at both sides of the piston, and of the supply: A is the side that u > 0 fills
+    pressures: Annotated[Pressures, Field(exclude_if=lambda value: value is None)] | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -141,6 +153,11 @@ class CylinderPlant(TermPlant):
     def has_physics(self) -> bool:
         """The columns say what u a motion asks for, and nothing of the motion that u makes."""
         return False
+
+    @property
+    def channels(self) -> Mapping[str, str]:
+        """The pressures."""
+        return {} if self.pressures is None else dict(zip(CHANNELS, vars(self.pressures).values(), strict=True))
 
     @property
     def columns(self) -> tuple[TermColumn, ...]:
@@ -183,7 +200,7 @@ class CylinderPlant(TermPlant):
         return tuple(
             Fault(name, parameter, range_, words, checks)
             for parameter, (name, range_, words, checks) in FAULTS.items()
-            if parameter in EXPONENTS or parameter in self.names
+            if parameter in EXPONENTS or parameter in self.names or self.pressures is not None
         )
 
     def exponents(self, parameter: str, healthy: Mapping[str, float] | None = None) -> Mapping[str, float]:
