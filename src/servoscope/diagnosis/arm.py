@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from servoscope.estimation.arm_regression import (
     filter_arm_log,
 )
 from servoscope.isolation.candidate import Candidate, FaultEstimate
+from servoscope.models.arm.dynamics import joint_positions
 from servoscope.signals.readers.arm_log import ArmRecording
 
 MIN_CERTAINTY = 0.9  # probability from which a cause is named
@@ -41,6 +42,16 @@ class ArmExamination(NamedTuple):
     outside: FloatArray  # torque that friction cannot explain, over half a second (n, M) [N m]
     evidence: ChangeEvidence | None
     events: list[ArmEvent]
+
+    def picture(self, baseline: ArmBaseline, diagnosis: Diagnosis) -> dict[str, Any]:
+        """Return where the joints are in the middle of the recording [m], and how likely each has changed."""
+        arm, q = baseline.model.arm, self.signals.q
+        odds = [
+            sum(candidate.probability for candidate in diagnosis.candidates if candidate.name.endswith(f" of {name}"))
+            for name in arm.names
+        ]
+        places = joint_positions(arm, q[len(q) // 2]).tolist()
+        return {"names": arm.names, "parents": arm.parents, "places": places, "odds": odds}
 
 
 @with_one_blas_thread
@@ -251,7 +262,7 @@ def _onset(evidence: ChangeEvidence, best: CauseEvidence) -> tuple[tuple[float, 
 
 def _fault(baseline: ArmBaseline, found: CauseEvidence) -> FaultEstimate | None:
     """Return a cause with its size; None of a change that is not known."""
-    kind, joint = found.cause.kind, found.cause.joint
+    kind, joint, name = found.cause.kind, found.cause.joint, found.cause.name
     if kind == UNKNOWN:
         return None
     value, low, high = _interval(baseline, found)
@@ -259,19 +270,19 @@ def _fault(baseline: ArmBaseline, found: CauseEvidence) -> FaultEstimate | None:
         link = float(baseline.model.arm.inertial[-1, 0])
         ratios = 1.0 + np.array([value, low, high]) / link
         return FaultEstimate(
-            name=kind, parameter="payload", ratio=ratios[0], interval=tuple(ratios[1:]), mass_kg=(value, low, high)
+            name=name, parameter="payload", ratio=ratios[0], interval=tuple(ratios[1:]), mass_kg=(value, low, high)
         )
     own = f"{joint}.{found.cause.parameter}"
     if kind == "friction":
         unit = baseline.coefficient(own)[0]
     elif kind == "drive gain":  # torque per current that is logged: the residual grows as the gain falls
         ratio, least, most = (1.0 / (1.0 + x) for x in (value, high, low))
-        return FaultEstimate(name=kind, parameter=own, ratio=ratio, interval=(least, most))
+        return FaultEstimate(name=name, parameter=own, ratio=ratio, interval=(least, most))
     else:  # without a healthy value of its own
         unit = baseline.torque[baseline.model.arm.names.index(joint)] if kind != "encoder offset" else 1.0
     ratios = 1.0 + np.array([value, low, high]) / unit
     return FaultEstimate(
-        name=kind, parameter=own, ratio=ratios[0], interval=(float(ratios[1:].min()), float(ratios[1:].max()))
+        name=name, parameter=own, ratio=ratios[0], interval=(float(ratios[1:].min()), float(ratios[1:].max()))
     )
 
 

@@ -93,6 +93,7 @@ def _sections(d: Diagnosis, known: DiagnosisContext) -> Document:
         Section("What to check", tuple(_checks(d, known)), HEADLINE),
         Section("When it was there", _timeline(d, known), EVIDENCE),
         Section("What else it could be", tuple(_explanations(d, known)), EVIDENCE, _other_causes(d)),
+        Section("The arm and its joints", (PicturePart("arm"),), EVIDENCE, say("arm.page_joints")),
         Section("Signals", (PicturePart("signals"),), EVIDENCE, say("report.signals")),
         Section("Warnings", _warnings(d, known), EVIDENCE, "What the reader should know about the recording."),
         Section("Why", _reasons(d), DETAILS, _clock_note(known)),

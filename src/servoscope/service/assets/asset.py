@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.arm import AnyBaseline
 from servoscope.core.errors import StateError
 from servoscope.core.messages import message, render
 from servoscope.diagnosis.monitor import Monitor
@@ -19,6 +19,7 @@ from servoscope.diagnosis.schedule import DiagnosisSchedule
 from servoscope.prognosis.forecast import Prognosis
 from servoscope.service.alarms import AlarmSettings, AlarmTransition, OperatorCommand
 from servoscope.service.assets.alarms import AssetAlarms
+from servoscope.service.assets.arm_monitor import ArmMonitor
 from servoscope.service.assets.block_lanes import BlockLanes, Followed
 from servoscope.service.assets.checkpoint import AssetState, StreamPosition, evolve
 from servoscope.service.assets.examination import StoredDiagnosis, carry_covariates, examine_blocks
@@ -76,7 +77,13 @@ class Asset(StateHolder):
     """
 
     def __init__(
-        self, name: str, baseline: Baseline, monitor: Monitor, policy: AssetPolicy, group: str = "", source: str = ""
+        self,
+        name: str,
+        baseline: AnyBaseline,
+        monitor: Monitor | ArmMonitor,
+        policy: AssetPolicy,
+        group: str = "",
+        source: str = "",
     ) -> None:
         super().__init__()
         self.name, self.baseline, self.policy, self.source = name, baseline, policy, source
