@@ -8,45 +8,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+from arm_halls import FRICTION, ONSET_S, SIZE, arm_hall, replayed_arm, write_arm
 from brokers import BEGAN, Running, Sender, started_broker, until
 from halls import asked, service_of
 
 from servoscope.baseline.arm import ArmBaseline
 from servoscope.core.errors import ConfigError
-from servoscope.learning.arm import learn_arm
 from servoscope.service.build import build_assets, check_service_file
 from servoscope.service.config import ServiceFile
-from servoscope.signals.readers.arm_log import read_arm_log
-from servoscope.simulation.arm import URDF, ArmChange, simulate_arm, simulated_arm, simulated_arm_loop
+from servoscope.simulation.arm import simulated_arm_loop
 
 pytestmark = pytest.mark.slow  # minutes of six joints are simulated and diagnosed
-
-WINDOW_S = 20.0
-ONSET_S = 45.0
-FRICTION = "friction of elbow"
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with arm.json, and run.csv in which the friction of a joint grows."""
-    made, loop, arm = tmp_path_factory.mktemp("hall"), simulated_arm_loop(), simulated_arm()
-    days = [read_arm_log(simulate_arm(seed, 20.0), loop, arm) for seed in range(3)]
-    learn_arm(loop, URDF.read_text(encoding="utf-8"), days).save(made / "arm.json")
-    log = simulate_arm(31, 90.0, ArmChange("friction", 1.6, 3, ONSET_S))
-    table = np.column_stack(list(log.values()))
-    np.savetxt(made / "run.csv", table, delimiter=",", header=",".join(log), comments="", fmt="%.7g")
-    return made
-
-
-def hall(folder: Path, name: str, source: str, more: str = "", baseline: str = "arm.json") -> Path:
-    path = folder / f"{name}.toml"
-    path.write_text(
-        f'name = "hall"\n[service]\nlisten = ""\ncommit_every_s = 0.05\nlog = "error"\n[store]\nurl = "{name}.sqlite"\n'
-        f"[diagnosis]\nwindow_s = {WINDOW_S}\n[sources.line]\n{source}\n"
-        f'[assets.cell]\nsource = "line"\nbaseline = "{baseline}"\n{more}\n',
-        encoding="utf-8",
-    )
-    return path
+    return write_arm(tmp_path_factory.mktemp("hall"))
 
 
 def messages(folder: Path) -> list[bytes]:
@@ -72,7 +49,7 @@ def is_diagnosed(config: Path, blocks: int) -> bool:
 
 def test_messages_of_all_joints_name_the_joint_and_raise_the_alarm(folder: Path, tmp_path: Path) -> None:
     broker = started_broker(tmp_path)
-    config = hall(folder, "broker", f'kind = "mqtt"\nhost = "127.0.0.1"\nport = {broker.port}')
+    config = arm_hall(folder, "broker", f'kind = "mqtt"\nhost = "127.0.0.1"\nport = {broker.port}')
     service = service_of(config)
     running = Running(service)
     try:
@@ -91,9 +68,9 @@ def test_messages_of_all_joints_name_the_joint_and_raise_the_alarm(folder: Path,
     assert summary.startswith("Fault: friction of elbow.") and " since 2026-01-01 00:00:4" in summary
     assert onset == pytest.approx(BEGAN + ONSET_S, abs=2.0)
     (fault,) = json.loads(document)["faults"]
-    assert fault["name"] == FRICTION and fault["interval"][0] < 1.6 < fault["interval"][1]
+    assert fault["name"] == FRICTION and fault["interval"][0] < SIZE < fault["interval"][1]
     sizes = asked(config, f"SELECT value FROM sizes WHERE name = '{FRICTION}'")
-    assert sizes and all(value == pytest.approx(1.6, abs=0.2) for (value,) in sizes)
+    assert sizes and all(value == pytest.approx(SIZE, abs=0.2) for (value,) in sizes)
     coefficients = {name for (name,) in asked(config, "SELECT name FROM sizes WHERE kind = 'coefficient'")}
     assert "elbow.coulomb_friction" in coefficients
     assert asked(config, "SELECT count(*) FROM residuals")[0][0] >= 3
@@ -105,7 +82,7 @@ def test_messages_of_all_joints_name_the_joint_and_raise_the_alarm(folder: Path,
 
 
 def test_a_killed_service_asks_for_the_diagnosis_again(folder: Path) -> None:
-    config = hall(folder, "killed", 'kind = "replay"\nstart = 2026-01-01T00:00:00Z\nspeed = 0.0', 'files = ["run.csv"]')
+    config = replayed_arm(folder, "killed")
     asset = build_assets(ServiceFile.load(config))["cell"]
     service_of(config).run()
     first = asked(config, "SELECT verdict, t, summary FROM diagnoses ORDER BY t")
@@ -133,10 +110,12 @@ def test_what_an_arm_cannot_be_is_refused_in_one_line(folder: Path) -> None:
         (rows, "", "depends on base_yaw.position, base_yaw.torque"),
     ):
         with pytest.raises(ConfigError, match=why):
-            check_service_file(ServiceFile.load(hall(folder, "refused", source, more)))
+            check_service_file(ServiceFile.load(arm_hall(folder, "refused", source, more)))
     assert (
         check_service_file(
-            ServiceFile.load(hall(folder, "taken", replay, f'files = ["run.csv"]\nlimits = {{ "{FRICTION}" = 1.5 }}'))
+            ServiceFile.load(
+                arm_hall(folder, "taken", replay, f'files = ["run.csv"]\nlimits = {{ "{FRICTION}" = 1.5 }}')
+            )
         )
         == []
     )

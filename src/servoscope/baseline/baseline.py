@@ -349,7 +349,7 @@ class Baseline(ShortRepr, BaselineMemory):
             ) from None
         if isinstance(content, Mapping) and content.get("format") == ARM_FORMAT:
             raise BaselineError(
-                f"{path}: baseline of an arm, which learn, diagnose and the service know; this takes that of one loop"
+                f"{path}: baseline of an arm, which diagnose, services and fleets take, and no other command"
             )
         if not isinstance(content, Mapping) or content.get("format") != FORMAT:
             raise BaselineError(f"{path}: is not a baseline; give the file that servoscope learn wrote")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from servoscope.baseline.arm import SERVICE_ODDS, UNKNOWN, ArmBaseline, ArmCause
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.blas import with_one_blas_thread
+from servoscope.core.errors import RecordingError
 from servoscope.core.messages import Message, message
 from servoscope.detection.arm_events import ArmEvent, find_events, outside_events, outside_torque
 from servoscope.detection.arm_evidence import INTERVAL, CauseEvidence, ChangeEvidence, ChangeTest
@@ -24,13 +26,14 @@ from servoscope.estimation.arm_regression import (
 )
 from servoscope.isolation.candidate import Candidate, FaultEstimate
 from servoscope.models.arm.dynamics import joint_positions
-from servoscope.signals.readers.arm_log import ArmRecording
+from servoscope.signals.readers.arm_log import ArmRecording, read_arm_log
 
 MIN_CERTAINTY = 0.9  # probability from which a cause is named
 MIN_EXPLAINED = 0.5  # share of the evidence of an unknown change from which one cause is named all the same
 MIN_PROBABILITY = 0.01  # of a cause that is listed
 MIN_RIVAL_PROBABILITY = 0.05  # of a cause that the headline of an open answer lists
 MAX_FACTOR = 20.0  # power of ten up to which evidence is written
+YEAR_S = 365.25 * 86400.0  # in which one healthy window may be called changed
 ONSET_TAIL = 0.025  # probability on either side of an onset's interval
 UNITS = {"offset": "N m", "counterbalance": "N m", "gear ripple": "N m", "encoder offset": "rad"}
 
@@ -52,6 +55,41 @@ class ArmExamination(NamedTuple):
         ]
         places = joint_positions(arm, q[len(q) // 2]).tolist()
         return {"names": arm.names, "parents": arm.parents, "places": places, "odds": odds}
+
+
+class ArmWindow(NamedTuple):
+    """The diagnosis of one of many windows of samples."""
+
+    diagnosis: Diagnosis
+    examination: ArmExamination
+    start: float  # when the diagnosis' time is 0 [s]
+    excess: float | None  # evidence of a change over its limit; None where the arm did not move
+
+
+@with_one_blas_thread
+def examine_window(baseline: ArmBaseline, name: str, t: FloatArray, signals: Mapping[str, FloatArray]) -> ArmWindow:
+    """Examine one of the windows that follow each other without end; the limit is for one false alarm a year.
+
+    `t`: (N,) [s]; `signals`: by their names in `ArmBaseline.logged_covariates`, (N,) each. Evidence is a Bayes factor,
+    so that no more than 1/k of healthy windows pass a limit that is k times as high. Raises RecordingError if the
+    samples cannot be used.
+    """
+    if lacking := [signal for signal in baseline.logged_covariates if signal not in signals]:
+        raise RecordingError(f"{name}: has no {', '.join(lacking)}, name columns as in the loop file of the arm")
+    whole = np.isfinite([t, *signals.values()]).all(axis=0)
+    if not whole.any():
+        raise RecordingError(f"{name}: no sample has all signals of all joints")
+    start, end = t[whole][[0, -1]].tolist()
+    looks = YEAR_S / max(end - start, 1.0)
+    limit = baseline.limit + max(0.0, float(np.log(looks * baseline.loop.false_alarms)))
+    raised = baseline.model_copy(update={"limit": limit})
+    try:
+        recording = read_arm_log({"t": t - start, **signals}, baseline.loop.of_channels(), baseline.model.arm)
+    except RecordingError as error:
+        raise RecordingError(f"{name}: {str(error).removeprefix('arrays: ')}") from None
+    diagnosis, exam = examine_arm(raised, replace(recording, name=name))
+    excess = None if exam.evidence is None else max(exam.evidence.log_factor, 0.0) / limit
+    return ArmWindow(diagnosis, exam, start, excess)
 
 
 @with_one_blas_thread

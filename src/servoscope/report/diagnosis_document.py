@@ -164,8 +164,7 @@ def _fault_facts(d: Diagnosis, known: DiagnosisContext) -> Iterator[Fact]:
         yield Fact("Since when", likely, (say("report.interval", low=low, high=high), *seen))
     elif seen:
         yield Fact("Since when", "not known", seen)
-    for fault in d.faults:
-        yield size_fact(fault)
+    yield from map(size_fact, d.faults)
     if d.faults:
         among = "report.among_pairs" if d.refit is not None else "report.among"
         yield Fact("How sure", format_probability(d.probability), (say(among),))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,7 @@ from servoscope.baseline.arm import ArmBaseline
 from servoscope.core.arrays import FloatArray
 from servoscope.detection.covariate_monitor import CovariateHistory
 from servoscope.detection.trace import Trace
+from servoscope.diagnosis.monitor import Monitor
 from servoscope.estimation.frequency_response import FrequencyResponse
 
 _NONE = np.zeros(0)
@@ -49,3 +51,6 @@ class ArmMonitor:
     def covariate_history(self, state: FloatArray) -> CovariateHistory:
         """Return that nothing is known of covariates: a joint that is missing is a gap."""
         return {}
+
+
+AnyMonitor: TypeAlias = Monitor | ArmMonitor

@@ -22,7 +22,6 @@ from servoscope.diagnosis.result import Verdict
 from servoscope.isolation.candidate import FaultEstimate
 from servoscope.service.sources.block import Block
 from servoscope.signals import Recording, clean
-from servoscope.signals.readers.arm_log import read_arm_log
 
 if TYPE_CHECKING:  # its kernels are loaded when something is examined
     from servoscope.diagnosis.examine import Examination
@@ -212,22 +211,16 @@ def diagnose_blocks(baseline: AnyBaseline, name: str, blocks: Sequence[Block]) -
 
 
 def _diagnose_arm(baseline: ArmBaseline, name: str, blocks: Sequence[Block]) -> StoredDiagnosis:
-    from servoscope.diagnosis.arm import examine_arm
+    from servoscope.diagnosis.arm import examine_window
 
     t, _, _, _, *signals = np.concatenate([block.signals for block in blocks], axis=1)
-    whole = np.isfinite([t, *signals]).all(axis=0)
-    if not whole.any():
-        return undetermined("unusable", error=f"{name}: no sample has all signals of all joints")
-    start = float(t[whole][0])
-    columns = {"t": t - start, **dict(zip(baseline.logged_covariates, signals, strict=True))}
     try:
-        recording = read_arm_log(columns, baseline.loop.of_channels(), baseline.model.arm)
-        diagnosis, exam = examine_arm(baseline, replace(recording, name=name))
+        window = examine_window(baseline, name, t, dict(zip(baseline.logged_covariates, signals, strict=True)))
     except ServoscopeError as error:
-        return undetermined("unusable", error=str(error).removeprefix("arrays: "))
-    evidence = None if exam.evidence is None else max(exam.evidence.log_factor, 0.0) / (baseline.limit or 1.0)
-    document = {**diagnosis.model_dump(mode="json"), "began": start, "evidence": evidence}
-    document["arm"] = exam.picture(baseline, diagnosis)
+        return undetermined("unusable", error=str(error))
+    diagnosis, start = window.diagnosis, window.start
+    picture = window.examination.picture(baseline, diagnosis)
+    document = {**diagnosis.model_dump(mode="json"), "began": start, "evidence": window.excess, "arm": picture}
     onset = start + diagnosis.onset_s[1] if diagnosis.onset_s is not None else None
     headline = diagnosis.dated_headline(start)
     return StoredDiagnosis(verdict=diagnosis.verdict, headline=headline, onset=onset, document=document)
