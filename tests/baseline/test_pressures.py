@@ -100,7 +100,7 @@ def test_few_recordings_or_none_of_the_pressures(learned: ss.Baseline) -> None:
     assert few.pressures is None
     assert any("pressures are learned" in str(note) for note in few.notes)
     bare = replace(day(41), channels={})
-    assert not model_of(learned).is_logged(bare)
+    assert model_of(learned).evidence(bare) is None
     assert ss.diagnose(learned, bare).verdict != "fault"
 
 

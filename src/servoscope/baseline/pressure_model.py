@@ -15,6 +15,7 @@ compared with those of healthy recordings, by how these scatter.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
@@ -157,9 +158,11 @@ class PressureModel(BaselineModel):
         """Standard deviations of coefficients of half a recording or more."""
         return np.asarray(np.sqrt(np.diag(np.array(self.halves))))
 
-    def is_logged(self, recording: Recording) -> bool:
-        """Whether a recording has all pressures throughout."""
-        return all(name in recording.channels and np.isfinite(recording.channels[name]).all() for name in CHANNELS)
+    def evidence(self, recording: Recording) -> PressureEvidence | None:
+        """Return what a recording shows; None where it lacks a pressure anywhere."""
+        if not all(name in recording.channels and np.isfinite(recording.channels[name]).all() for name in CHANNELS):
+            return None
+        return PressureEvidence(self, self.layout.sums(recording))
 
     def ratios(self, sums: Sums) -> FloatArray:
         """Return the largest deviation of a recording, and of its second half from its first, over their limits."""
@@ -199,6 +202,19 @@ class PressureModel(BaselineModel):
     def stretch_covariance(self, rows: float) -> FloatArray:
         """Return the covariance (n, n) of coefficients of so many samples of a healthy recording."""
         return np.array(self.halves) * max(1.0, 0.5 * self.rows / max(rows, 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class PressureEvidence:
+    """What the pressures of one recording show."""
+
+    model: PressureModel
+    sums: Sums
+
+    @cached_property
+    def excess(self) -> float:
+        """The largest deviation over its limit."""
+        return float(self.model.ratios(self.sums).max())
 
 
 def halves(sums: Sums) -> tuple[Sums, Sums]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.expectation import Expectation, reference_path
+from servoscope.baseline.pressure_model import PIECE_S
 from servoscope.baseline.residual_model import ResidualModel
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError, RecordingError
@@ -103,8 +104,9 @@ def isolation_inputs(exam: Examination, onset: Onset, at: int) -> tuple[list[Sig
     recursive = e.theta[at] - exam.expected[at], e.S[at] * max(1.0, float(e.power[at])) + known
     if whole is not None:
         whole = whole[0], whole[1] + known
-    elif exam.pressure_sums is not None:
-        return pressure_inputs(exam, onset)
+    elif exam.pressures is not None:
+        begin = onset.sample // round(PIECE_S * recording.sample_rate)
+        return pressure_inputs(exam.pressures, exam.baseline.plant, begin)
     elif (model := exam.baseline.residual) is not None and model.halves:
         whole = _deviation_of_stretch(exam, model, onset, last)
     deviation, covariance = whole or recursive

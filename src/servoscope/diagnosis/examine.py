@@ -14,15 +14,14 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.covariates import CovariatePath
 from servoscope.baseline.expectation import Expectation, ReferencePath, reference_path, residual_noise_model
 from servoscope.baseline.motion import RecordedMotion
-from servoscope.baseline.pressure_model import Sums
+from servoscope.baseline.pressure_model import PressureEvidence
 from servoscope.core import outofcore
-from servoscope.core.arrays import FloatArray
+from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import RecordingError
 from servoscope.detection import cusum_design
 from servoscope.detection.baseline_run import BaselineRun, baseline_run, cusum_constants
@@ -35,7 +34,7 @@ from servoscope.estimation.pipeline import Estimates, EstimationRunner, Pipeline
 from servoscope.isolation.ml.axis_scan import AxisChange
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
-from servoscope.simulation import closed_loop_poles
+from servoscope.simulation.stability import settling_samples
 
 MAX_SKIPPED_SHARE = 0.2  # share of updates that an estimator's guard may skip before the AKF takes over
 MIN_INSTRUMENT_EIGENVALUE = 0.05  # of 1; below, the recursion follows too slowly, and below 0 it runs away
@@ -83,8 +82,7 @@ class Examination:
             )
         along, pipeline = None, baseline.pipeline()
         if (model := baseline.covariates) is not None:
-            memory = pipeline.memory_samples
-            theta = np.array(baseline.theta)
+            memory, theta = pipeline.memory_samples, np.array(baseline.theta)
             if model.warm_up is None:
                 along = CovariatePath.of(model, theta, recording.channels, memory)
             else:
@@ -145,7 +143,7 @@ class Examination:
         return np.asarray(self.noise_growth * self.estimates.S[at] + known)
 
     @property
-    def ready(self) -> npt.NDArray[np.bool_]:
+    def ready(self) -> BoolArray:
         """Whether the estimator had learned anything by then, shape (K,)."""
         return self.estimates.updates > 0
 
@@ -169,18 +167,10 @@ class Examination:
         return np.full(2, np.nan) if model is None else model.ratios_of(self.pipeline, self.recording)
 
     @cached_property
-    def pressure_sums(self) -> Sums | None:
-        """What logged pressures show, piece by piece; None where none were learned or logged, or it is `quick`."""
-        model = self.baseline.pressures
-        if model is None or self.quick or not model.is_logged(self.recording):
-            return None
-        return model.layout.sums(self.recording)
-
-    @cached_property
-    def pressure_ratios(self) -> FloatArray:
-        """Deviations of the pressures over their limits, see `PressureModel.ratios`; NaN: no evidence."""
-        model, sums = self.baseline.pressures, self.pressure_sums
-        return np.full(2, np.nan) if model is None or sums is None else model.ratios(sums)
+    def pressures(self) -> PressureEvidence | None:
+        """What logged pressures show; None where none were learned or logged, or it is `quick`."""
+        model = None if self.quick else self.baseline.pressures
+        return None if model is None else model.evidence(self.recording)
 
     @property
     def features_changed_s(self) -> float | None:
@@ -189,23 +179,23 @@ class Examination:
         return None if span is None else float(self.recording.t[span.end - 1])
 
     @cached_property
-    def apparent_alarm(self) -> npt.NDArray[np.bool_]:
+    def apparent_alarm(self) -> BoolArray:
         """Whether a statistic of the coefficients was above its limit, after the delays, shape (K,)."""
         return self._changed | apply_alarm_delays(any_exceeded(self.statistics[:2]), *self.pipeline.delays)
 
     @property
-    def _changed(self) -> npt.NDArray[np.bool_]:
+    def _changed(self) -> BoolArray:
         """Whether a change within the recording had been detected, or was not yet repaired, shape (K,)."""
         change, index = self.change, self.estimates.index
         if change is None:  # what is left of u speaks of the whole recording
-            ratios = np.append(self.residual_ratios, self.pressure_ratios)
-            return np.asarray((index == index[-1:].sum()) & (ratios > 1.0).any())
+            off = (self.residual_ratios > 1.0).any() or (self.pressures is not None and self.pressures.excess > 1.0)
+            return np.asarray((index == index[-1:].sum()) & off)
         if change.repaired:
             return np.asarray(index < change.onset)
         return np.asarray(index >= index[-1:].min(initial=change.detected))  # or detected after the last evaluation
 
     @cached_property
-    def alarm(self) -> npt.NDArray[np.bool_]:
+    def alarm(self) -> BoolArray:
         """Whether there was an alarm of the coefficients that a motion never seen does not explain, shape (K,)."""
         if not self.apparent_alarm.any() or self.motion is None:  # in this order: the motion takes a second reading
             return self.apparent_alarm
@@ -247,8 +237,9 @@ class Examination:
         """
         pipeline, tuning = self.pipeline, self.tuning
         end, period = (at + 1) * pipeline.every, int(np.lcm(pipeline.every, pipeline.stride))
-        settling = pipeline.bank.wait + (_settling(pipeline, self.baseline.plant) if self.noise is not None else 0)
-        memories = MEMORIES
+        settling, memories = pipeline.bank.wait, MEMORIES
+        if self.noise is not None:
+            settling += settling_samples(pipeline.loop, self.baseline.plant, FORGOTTEN_SHARE)
         while True:
             learning = end - round(memories * pipeline.memory * pipeline.stride)
             first = (learning - settling) // period * period
@@ -300,12 +291,6 @@ class Examination:
             k += len(piece)
             outofcore.release(found, *self.recording.columns)
         return found
-
-
-def _settling(pipeline: Pipeline, plant: Plant) -> int:
-    """Return how many samples a loop takes to forget its initial state."""
-    slowest = float(np.abs(closed_loop_poles(pipeline.loop, plant)).max())
-    return int(np.ceil(np.log(FORGOTTEN_SHARE) / np.log(slowest))) if 0.0 < slowest < 1.0 else 0
 
 
 def _reference_piece(recording: Recording, rows: slice, first: int) -> ReferencePath:
@@ -381,8 +366,7 @@ def _run_recursion(
             kept.result()
     found = {name: column.to_array() for name, column in columns.items()}
     expected, T2 = found.pop("expected"), found.pop("statistic")
-    estimates = Estimates(**found)
-    return Examination(baseline, recording, pipeline, tuning, estimates, noise, expected, T2, 0.0, growth)
+    return Examination(baseline, recording, pipeline, tuning, Estimates(**found), noise, expected, T2, 0.0, growth)
 
 
 def _noise_growth(pipeline: Pipeline, estimates: Estimates) -> float:

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from servoscope.baseline.pressure_model import EXPONENTS, NAMES, PIECE_S
+from servoscope.baseline.pressure_model import EXPONENTS, NAMES, PIECE_S, PressureEvidence
 from servoscope.core.arrays import FloatArray
 from servoscope.detection.onset import Onset
-from servoscope.diagnosis.examine import Examination
 from servoscope.isolation.signature import Signature
 from servoscope.isolation.signatures import power_signatures
+from servoscope.models.plants import Plant
+from servoscope.signals import Recording
 
 ONSET_PIECES = 3  # either way, by which an onset may be off
 # by which a fault leaves its curve, in standard deviations of the coefficients [rad]: valves are not as symmetric, and
@@ -20,12 +21,9 @@ ANGLES = {"gain_forward": 0.3, "gain_backward": 0.3, "load": 0.3, "process": 0.5
 ANGLE = 0.05  # of all others: the filters pass on a little of one column's change to others
 
 
-def pressure_onset(exam: Examination) -> Onset:
+def pressure_onset(pressures: PressureEvidence, recording: Recording) -> Onset:
     """Return since when the pressures differ from healthy ones."""
-    model, sums, recording = exam.baseline.pressures, exam.pressure_sums, exam.recording
-    assert model is not None
-    assert sums is not None
-    begin = model.onset(sums)
+    begin = pressures.model.onset(pressures.sums)
     last, piece = recording.samples - 1, round(PIECE_S * recording.sample_rate)
     margin = ONSET_PIECES if begin else 0
     low, sample, high = (min(max(k, 0) * piece, last) for k in (begin - margin, begin, begin + margin))
@@ -33,13 +31,12 @@ def pressure_onset(exam: Examination) -> Onset:
     return Onset(float(t[low]), float(t[sample]), float(t[high]), sample)
 
 
-def pressure_inputs(exam: Examination, onset: Onset) -> tuple[list[Signature], FloatArray, FloatArray]:
-    """Return what isolation compares: signatures, and the deviation (n,) of the pressures' coefficients, (n, n)."""
-    model, sums, plant = exam.baseline.pressures, exam.pressure_sums, exam.baseline.plant
-    assert model is not None
-    assert sums is not None
-    since = slice(onset.sample // round(PIECE_S * exam.recording.sample_rate), None)
-    stretch = tuple(S[since].sum(axis=0) for S in sums)
+def pressure_inputs(
+    pressures: PressureEvidence, plant: Plant, begin: int
+) -> tuple[list[Signature], FloatArray, FloatArray]:
+    """Return what isolation compares of the pieces from `begin` on: signatures, deviation (n,), covariance (n, n)."""
+    model = pressures.model
+    stretch = tuple(S[begin:].sum(axis=0) for S in pressures.sums)
     theta = np.array(model.theta)
     deviation = model.layout.coefficients(stretch) - theta
     known = np.flatnonzero(np.isfinite(deviation))

@@ -46,8 +46,8 @@ def detectable_sizes(exam: Examination) -> dict[str, tuple[float, float]]:
     smallest = {
         name: float(np.sqrt(needed / one)) if one > 0.0 else np.inf for name, one in zip(promised, best, strict=True)
     }
-    if exam.baseline.pressures is not None and exam.pressure_sums is not None:
-        for name, size in exam.baseline.pressures.detectable_changes.items():
+    if exam.pressures is not None:
+        for name, size in exam.pressures.model.detectable_changes.items():
             if name in smallest:
                 smallest[name] = min(smallest[name], size)
     if exam.along is not None and exam.along.std is not None:

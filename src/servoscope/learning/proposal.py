@@ -22,7 +22,7 @@ from servoscope.learning.inspection import Inspection, inspect
 from servoscope.learning.inspection.rules import advised_rest_speed
 from servoscope.learning.plant_choice import PlantCandidate, choose_plant
 from servoscope.models.loop import Columns, Loop, MonitorSettings
-from servoscope.models.plants.cylinder import CylinderPlant
+from servoscope.models.plants import plant_class
 from servoscope.signals import Recording
 from servoscope.signals.readers import ChannelInfo, list_channels, read
 from servoscope.signals.readers.axes import find_axes, signal_names
@@ -175,13 +175,8 @@ def propose_loop(paths: Sequence[Path], columns: Columns, where: Mapping[str, st
         candidates = choose_plant(recordings, cutoff, is_speed, inspection.rest.speed)
     except NotEnoughError as error:
         raise RecordingError(f"{path}: {error}") from None
-    chosen = candidates[0]
+    chosen = _with_pressures(candidates[0], path, columns)
     loop = loop_of(chosen.settings)
-    if isinstance(loop.plant, CylinderPlant):
-        pressures = guess_pressures([channel.name for channel in list_channels(path, columns.text)])
-        if pressures is not None:
-            chosen = replace(chosen, settings={**chosen.settings, "pressures": pressures})
-            loop = loop_of(chosen.settings)
     held = []
     if (speed := advised_rest_speed(inspect(recording, loop), loop)) is not None:
         speed = float(f"{speed:.2g}")
@@ -226,6 +221,13 @@ def _inspect(recording: Recording, is_speed: bool) -> Inspection:
     if not is_speed:
         return inspect(recording)
     return inspect(recording, Loop.from_dict({"sample_rate": recording.sample_rate, "plant": SPEED_AXIS}))
+
+
+def _with_pressures(chosen: PlantCandidate, path: Path, columns: Columns) -> PlantCandidate:
+    """Return a plant with the columns of pressures, where it takes some and the log has them."""
+    takes = "pressures" in plant_class(chosen.settings["kind"]).model_fields
+    pressures = guess_pressures([channel.name for channel in list_channels(path, columns.text)]) if takes else None
+    return chosen if pressures is None else replace(chosen, settings={**chosen.settings, "pressures": pressures})
 
 
 def _plant_lines(chosen: PlantCandidate) -> list[ProposalLine]:
