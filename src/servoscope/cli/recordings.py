@@ -140,10 +140,10 @@ def learn(
     """Learn from healthy recordings what healthy looks like, and from labelled ones what faults look like."""
     if add:
         others = output is not None or nominal or compare is not None or fault or population
-        more = [*add, *([str(loop)] if loop is not None else []), *(healthy or ())]
+        logs = [*add, *([str(loop)] if loop is not None else []), *(healthy or ())]
         path = None if others else baseline
         add_recordings(
-            path, more, reading, as_json, after, why, who, accept_change, accept_delay=accept_delay, force=force
+            path, logs, reading, as_json, after, why, who, accept_change, accept_delay=accept_delay, force=force
         )
         return
     if loop is None or output is None:
@@ -333,18 +333,18 @@ def verify(
     read = reader.read(recording)
     if len(read) != 1:
         raise RecordingError(f"{recording}: holds {len(read)} recordings, choose one with --where")
-    found = verification.verify(told, learned, read[0])
+    verified = verification.verify(told, learned, read[0])
     if as_json:
-        plain = plain_values.to_plain_values(found)
+        plain = plain_values.to_plain_values(verified)
         texts = {
-            "differences": [str(difference) for difference in found.differences],
-            "remarks": [str(remark) for remark in found.remarks],
+            "differences": [str(difference) for difference in verified.differences],
+            "remarks": [str(remark) for remark in verified.remarks],
         }
         print_json({**plain, **texts} if isinstance(plain, dict) else plain, lines=False)
     else:
         out = results.create_console()
         verdict = say("verify.same", verdict=told.verdict)
-        out.print(verdict if found.same else say("verify.changed", differences=found.differences))
-        results.print_notes(out, [str(remark) for remark in found.remarks])
-    if not found.same:
+        out.print(verdict if verified.same else say("verify.changed", differences=verified.differences))
+        results.print_notes(out, [str(remark) for remark in verified.remarks])
+    if not verified.same:
         raise typer.Exit(EXIT_INPUT)

@@ -172,10 +172,10 @@ class WindowLanes:
         """Feed a block, each of shape (assets, N); change the rows; yield asset and window, asset by asset."""
         most = len(rows) * self._levels * (r.shape[1] // self._shortest + 1)
         out, lane = np.empty((most, ROW_HEADER + self._sums)), np.empty(most, dtype=np.int64)
-        found = _compile()(self._table, rows, self._begins, r, u, y, restart, out, lane)
-        for asset, row in zip(lane[:found].tolist(), out, strict=False):
-            if (one := self._assets[asset]) is not None:
-                yield asset, one.window(row)
+        count = _compile()(self._table, rows, self._begins, r, u, y, restart, out, lane)
+        for asset, row in zip(lane[:count].tolist(), out, strict=False):
+            if (features := self._assets[asset]) is not None:
+                yield asset, features.window(row)
 
 
 @functools.cache
@@ -208,7 +208,7 @@ def _accumulate(
         window, levels, span, settling, edges, bands = c[0], int(c[1]), c[2], c[3], int(c[4]), int(c[5])
         if bands == 0:
             continue
-        rest, rate, smoothing = c[6], c[7], c[8]
+        resting, rate, smoothing = c[6], c[7], c[8]
         bins, begin = 3 * (edges + 1), HEADER + 8 * bands
         sums, powers = 3 * bins + 3 * (2 * bands + 1), begin + 1 + 3 * bins
         for i in range(2 * bands):
@@ -236,9 +236,9 @@ def _accumulate(
             speed += smoothing * ((r[k] - before) * rate - speed)
             before = r[k]
             motion = 2
-            if speed > rest:
+            if speed > resting:
                 motion = 0
-            elif speed < -rest:
+            elif speed < -resting:
                 motion = 1
             moving = moving + 4 if moving & 3 == motion else motion
             since, place = float(moving >> 2), motion * (edges + 1)

@@ -100,7 +100,7 @@ def _run_tasks(found: SparkSession, wave: Sequence[Task]) -> list[dict[str, Any]
                 yield pa.RecordBatch.from_pydict({"i": [i], "result": [json.dumps(wave[i].run())]})
 
     done = found.range(0, len(wave), 1, len(wave)).mapInArrow(work, "i long, result string").collect()
-    return [json.loads(each.result) for each in sorted(done, key=lambda each: each.i)]
+    return [json.loads(task.result) for task in sorted(done, key=lambda task: task.i)]
 
 
 def _run_isolated(found: SparkSession, task: Task) -> dict[str, Any]:
