@@ -60,7 +60,7 @@ class Examination:
     statistic: FloatArray  # T^2, shape (K,)
     skipped_share: float  # share of the updates that the estimator's guard skipped
     noise_growth: float  # of the noise's variance against the baseline's
-    change: AxisChange | None = None  # within the recording, where it is one of a motor axis
+    apparent_change: AxisChange | None = None  # within the recording, where it is one of a motor axis
     along: CovariatePath | None = None  # what covariates make of the coefficients; None where none were learned
     replaced: bool = False  # whether the instrument of the nominal loop failed and the AKF took over
     quick: bool = False  # whether features are left out: of assets that are monitored, the monitor follows them
@@ -111,7 +111,7 @@ class Examination:
             from servoscope.isolation.ml.axis_scan import find_axis_change
 
             change = find_axis_change(baseline, recording)
-        return replace(exam, skipped_share=skipped, replaced=replaced, change=change, quick=quick)
+        return replace(exam, skipped_share=skipped, replaced=replaced, apparent_change=change, quick=quick)
 
     @cached_property
     def drifts(self) -> bool:
@@ -176,12 +176,21 @@ class Examination:
     @cached_property
     def apparent_alarm(self) -> npt.NDArray[np.bool_]:
         """Whether a statistic of the coefficients was above its limit, after the delays, shape (K,)."""
-        return self._changed | apply_alarm_delays(any_exceeded(self.statistics[:2]), *self.pipeline.delays)
+        changed = self._changed(self.apparent_change)
+        return changed | apply_alarm_delays(any_exceeded(self.statistics[:2]), *self.pipeline.delays)
 
-    @property
-    def _changed(self) -> npt.NDArray[np.bool_]:
-        """Whether a change within the recording had been detected, or was not yet repaired, shape (K,)."""
-        change, index = self.change, self.estimates.index
+    @cached_property
+    def change(self) -> AxisChange | None:
+        """The change within the recording; None where a motion never seen may explain it: its limit knows none."""
+        change = self.apparent_change
+        if change is None:
+            return None
+        at = min(int(np.searchsorted(self.estimates.index, change.detected)), self.evaluations - 1)
+        return None if (self.motion_excess(slice(at, at + 1)) >= UNSEEN_EXCESS).any() else change
+
+    def _changed(self, change: AxisChange | None) -> npt.NDArray[np.bool_]:
+        """Return whether a change within the recording had been detected, or was not yet repaired, shape (K,)."""
+        index = self.estimates.index
         if change is None:  # what is left of u speaks of the whole recording
             return np.asarray((index == index[-1:].sum()) & (self.residual_ratios > 1.0).any())
         if change.repaired:
@@ -202,7 +211,7 @@ class Examination:
             exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & (self.motion_excess(at) < UNSEEN_EXCESS))
         exceeded &= any_exceeded(self.statistics[:2])
         self.release()
-        return self._changed | apply_alarm_delays(exceeded, *self.pipeline.delays)
+        return self._changed(self.change) | apply_alarm_delays(exceeded, *self.pipeline.delays)
 
     @cached_property
     def motion(self) -> RecordedMotion | None:
