@@ -211,10 +211,10 @@ def _gramian_factor(A: FloatArray, B: FloatArray) -> FloatArray:
     """Return L with ``L L' = sum_i A^i B B' A'^i``, by doubling (Smith, 1968): small parts keep their digits."""
     L, power = B, A
     while True:
-        more = power @ L
-        U, s, _ = np.linalg.svd(np.hstack([L, more]), full_matrices=False)
+        increment = power @ L
+        U, s, _ = np.linalg.svd(np.hstack([L, increment]), full_matrices=False)
         L, power = np.asarray(U * s, dtype=np.float64), power @ power
-        if np.all(np.abs(more).max(axis=1) <= ROUNDING_TOLERANCE * np.abs(L).max(axis=1)):
+        if np.all(np.abs(increment).max(axis=1) <= ROUNDING_TOLERANCE * np.abs(L).max(axis=1)):
             return L
 
 

@@ -46,8 +46,8 @@ def run_reproduction(seeds: Sequence[int], told: StepCallback = lambda _: None) 
     """Measure everything, on all cores; `told` takes the name of each job that is done."""
     work = jobs.list_jobs(seeds)
     done: list[tuple[SeedJob, dict[str, float]]] = []
-    for job, found in run_jobs(work, min(core_count(), len(work))):
-        done.append((job, found))
+    for job, outcome in run_jobs(work, min(core_count(), len(work))):
+        done.append((job, outcome))
         told(f"seed {job.seed}, {job.part}")
     metrics = jobs.merge_metrics(done)
     return Reproduction(tuple(seeds), metrics, tuple(claims.evaluate_claims(metrics)))
@@ -59,10 +59,10 @@ def run_jobs(work: Sequence[SeedJob], processes: int) -> Iterator[tuple[SeedJob,
         yield from ((job, jobs.run_job(job)) for job in work)
         return
     pool = Workers(environment={**os.environ, **dict.fromkeys(ONE_THREAD, "1")})
-    for job, found in pool.map(f"{__name__}:run_in_worker", work, processes):
-        if isinstance(found, WorkerError):
-            raise found
-        yield job, found
+    for job, outcome in pool.map(f"{__name__}:run_in_worker", work, processes):
+        if isinstance(outcome, WorkerError):
+            raise outcome
+        yield job, outcome
 
 
 def run_in_worker(_: StepCallback, job: SeedJob) -> dict[str, float]:

@@ -69,8 +69,8 @@ def cv_ratio(
 ) -> float:
     """Return CV of one estimator over that of another at equal rise time; below 1 the first is the quieter."""
     pairs = [
-        (curve_column(flat, conditions, each, "rise"), curve_column(flat, conditions, each, name))
-        for each in (one, other)
+        (curve_column(flat, conditions, curve, "rise"), curve_column(flat, conditions, curve, name))
+        for curve in (one, other)
     ]
     return metrics.ratio_at_equal_rise(*pairs[0], *pairs[1])
 

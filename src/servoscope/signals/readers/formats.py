@@ -171,14 +171,14 @@ def _open_plain(path: Path, text: TextLayout | None) -> TableFile:
 
 def _recognise(head: bytes) -> str | None:
     """Return what a file is by its first bytes; None for text."""
-    found = next((kind for magic, kind in MAGIC.items() if head.startswith(magic)), None)
-    if found is None and head[:256].lstrip(b"\xef\xbb\xbf \r\n\t").lower().startswith(
+    name = next((kind for magic, kind in MAGIC.items() if head.startswith(magic)), None)
+    if name is None and head[:256].lstrip(b"\xef\xbb\xbf \r\n\t").lower().startswith(
         (b"<!doctype", b"<html", b"<?xml", b"<svg")
     ):
         return "HTML or XML page"
-    if found is None and b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff")) and not is_utf16(head):
+    if name is None and b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff")) and not is_utf16(head):
         return "binary file"
-    return found
+    return name
 
 
 def _check_format(path: Path, head: bytes, wanted: str) -> None:

@@ -225,13 +225,13 @@ def _read_rows(
         if apart is not None:
             cells = apart.read(table)
             rows = {format_cell(v): mask & (cells == v) for v in dict.fromkeys(cells[mask].tolist())}
-        each = {
+        evaluated = {
             what: [_evaluate_signal(table, combination, what, unwrappers) for combination in several]
             for what, several in signals.items()
         }
         values = [
             several[0] if len(several) == 1 else np.mean(several, axis=0)
-            for several in itertools.islice(each.values(), 3)
+            for several in itertools.islice(evaluated.values(), 3)
         ]
         if clock is not None:
             values.insert(0, clock.seconds(table))
@@ -240,8 +240,8 @@ def _read_rows(
             run = int(runs[-1])
             values.append(runs)
         if sensors:
-            values += each["[columns] output"]
-        values += [each[f"[columns] covariates.{covariate}"][0] for covariate in columns.covariates]
+            values += evaluated["[columns] output"]
+        values += [evaluated[f"[columns] covariates.{covariate}"][0] for covariate in columns.covariates]
         for value, mine in rows.items():
             if value not in parts:
                 parts[value] = LoggedRows(name if by is None else f"{name}[{by}={value}]", *options)
@@ -344,11 +344,17 @@ class LoggedRows:
         signals, run, covariates = self.split_columns()
         return self._clean(signals, run, covariates)
 
-    def _clean(self, signals: list[FloatArray], run: FloatArray | None, each: dict[str, FloatArray]) -> Recording:
+    def _clean(self, signals: list[FloatArray], run: FloatArray | None, covariates: dict[str, FloatArray]) -> Recording:
         t, r, u, y = signals
         limits = self._loop.input_limits if self._loop is not None else None
         notes = [self._note(*torn, t) for torn in self._broken]
-        options = {"sample_rate": self._rate, "run": run, "limits": limits, "labels": self._labels, "channels": each}
+        options = {
+            "sample_rate": self._rate,
+            "run": run,
+            "limits": limits,
+            "labels": self._labels,
+            "channels": covariates,
+        }
         recording = clean(t, r, u, y, name=self.name, target=self._target, **options)  # type: ignore[arg-type]
         if not self._has_time:
             text = message("defect.no_time", rate=recording.sample_rate)

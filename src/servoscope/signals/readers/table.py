@@ -187,8 +187,8 @@ class TimeColumn:
         seconds = self._clocks[name].seconds(cells)
         if isinstance(seconds, int):
             raise RecordingError(
-                f"{table.name}: row {table.row_number(seconds)}, column {name!r}: {str(cells[seconds])[:40]!r} is neither a"
-                " date nor a time, correct it or leave the cell empty"
+                f"{table.name}: row {table.row_number(seconds)}, column {name!r}: "
+                f"{str(cells[seconds])[:40]!r} is neither a date nor a time, correct it or leave the cell empty"
             )
         if self._begin is None and len(self.columns) == 1 and np.isfinite(seconds).any():
             self._begin = float(seconds[np.isfinite(seconds)][0])

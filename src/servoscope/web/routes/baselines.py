@@ -82,7 +82,7 @@ def _saved_baseline(context: Context, record: responses.BaselineRecord) -> Basel
 
 
 def _baseline_facts(baseline: Baseline) -> responses.BaselineFacts:
-    sources = [source for one in baseline.per_point for source in one.sources]
+    sources = [source for member in baseline.per_point for source in member.sources]
     return responses.BaselineFacts(
         loop=baseline.loop.name,
         hash=baseline.hash,

@@ -143,7 +143,7 @@ def _upload_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
     record = context.storage.read(responses.UploadDiagnosis, id_.removeprefix(UPLOAD_PREFIX))
     path = context.storage.path(responses.UploadDiagnosis, record.id) / "data.json"
     data = json.loads(path.read_bytes())
-    coefficients = {one["name"]: one["unit"] for one in data["trace"]["parameters"]}
+    coefficients = {coefficient["name"]: coefficient["unit"] for coefficient in data["trace"]["parameters"]}
     y, u = data["units"]
     known = DiagnosisContext(words=data["words"], units=(y, u), coefficient_units=coefficients)
     return responses.DiagnosisDetail(
