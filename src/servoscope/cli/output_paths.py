@@ -43,9 +43,9 @@ def check_output(
         raise OutputError(f"{path}: cannot be written, there is no folder {path.parent}; make it first")
 
 
-def _is_same_file(one: Path, other: Path) -> bool:
+def _is_same_file(path: Path, other: Path) -> bool:
     try:
-        return one.samefile(other)
+        return path.samefile(other)
     except OSError:
         return False
 

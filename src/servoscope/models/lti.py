@@ -277,16 +277,16 @@ def state_variable_filter(cutoff: float, order: int) -> StateSpace:
     return rate * A, rate * B, np.diag(rate ** np.arange(order, dtype=np.float64))
 
 
-def settling_samples(cutoff: float, order: int, dt: float, rest: float = 1e-3) -> int:
-    """Count the samples after which a step's transient in a state-variable filter is below `rest`."""
-    return math.ceil(_settling_time(order, rest) / (2.0 * math.pi * cutoff * dt))
+def settling_samples(cutoff: float, order: int, dt: float, tolerance: float = 1e-3) -> int:
+    """Count the samples after which a step's transient in a state-variable filter is below `tolerance`."""
+    return math.ceil(_settling_time(order, tolerance) / (2.0 * math.pi * cutoff * dt))
 
 
 @functools.cache
-def _settling_time(order: int, rest: float) -> float:
+def _settling_time(order: int, tolerance: float) -> float:
     """Return the same in time constants of the filter."""
     x = 0.0
-    while sum(x**j / math.factorial(j) for j in range(order)) * math.exp(-x) > rest:
+    while sum(x**j / math.factorial(j) for j in range(order)) * math.exp(-x) > tolerance:
         x += 0.01
     return x
 

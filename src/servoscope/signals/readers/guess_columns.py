@@ -176,9 +176,9 @@ def _named_alike(names: Sequence[str], parts: Mapping[str, set[str]]) -> tuple[s
     return None
 
 
-def _units_agree(one: str, other: str) -> bool:
+def _units_agree(name: str, other: str) -> bool:
     """Tell whether two names have the same unit, or one has none."""
-    units = {split_unit(one)[1], split_unit(other)[1]} - {""}
+    units = {split_unit(name)[1], split_unit(other)[1]} - {""}
     return len(units) < 2
 
 
