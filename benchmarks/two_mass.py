@@ -142,9 +142,24 @@ def main() -> None:
         halves.append((name, f"{false} of {given.half}", verdict))
     heads = "detector", "false", "found", "named right", "named wrong", "sizes within their interval"
     tables = [
-        Table("Two masses: detectors", f"{len(learned)} healthy days learned.", heads, tuple(summary)),
-        Table("Two masses: faults", "Found.", ("fault", *(score.name for score in scores)), tuple(kinds)),
-        Table("Two masses: half speed", "", ("detector", "false", "doubled friction"), tuple(halves)),
+        Table(
+            "Two masses: detectors",
+            f"{len(learned)} healthy days learned; {len(healthy)} healthy days and {len(changes)} faults judged.",
+            heads,
+            tuple(summary),
+        ),
+        Table(
+            "Two masses: faults",
+            "How many of each kind are found, in three sizes, from the start and from the middle.",
+            ("fault", *(score.name for score in scores)),
+            tuple(kinds),
+        ),
+        Table(
+            "Two masses: half speed",
+            "Healthy days called faulty, and the verdict on doubled friction.",
+            ("detector", "false", "doubled friction"),
+            tuple(halves),
+        ),
     ]
     show(tables, given.json)
 
