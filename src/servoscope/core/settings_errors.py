@@ -100,9 +100,8 @@ def _resolve_location(model: type[BaseModel], loc: tuple[int | str, ...]) -> tup
             owner = at
             at = at.model_fields[part].annotation if part in at.model_fields else Any
         elif get_args(at):
-            at = [argument for argument in get_args(at) if argument is not ...][
-                -1
-            ]  # the values of a table, the entries of a list
+            # the values of a table, the entries of a list
+            at = [argument for argument in get_args(at) if argument is not ...][-1]
     return place, owner
 
 

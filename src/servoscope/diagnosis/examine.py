@@ -182,8 +182,7 @@ class Examination:
     @cached_property
     def change(self) -> AxisChange | None:
         """The change within the recording; None where a motion never seen may explain it: its limit knows none."""
-        change = self.apparent_change
-        if change is None:
+        if (change := self.apparent_change) is None:
             return None
         at = min(int(np.searchsorted(self.estimates.index, change.detected)), self.evaluations - 1)
         return None if (self.motion_excess(slice(at, at + 1)) >= UNSEEN_EXCESS).any() else change
@@ -303,8 +302,7 @@ def _settling(pipeline: Pipeline, plant: Plant) -> int:
 
 def _reference_piece(recording: Recording, rows: slice, first: int) -> ReferencePath:
     """Return the reference of a chunk; the run began at sample `first`."""
-    before = rows.start - 1
-    ahead = (float(recording.t[before]), float(recording.r[before])) if rows.start > first else None
+    ahead = (float(recording.t[rows.start - 1]), float(recording.r[rows.start - 1])) if rows.start > first else None
     return reference_path(recording.rows(rows), ahead)
 
 
@@ -328,9 +326,8 @@ def _run_recursion(
 
     `run`: with the baseline's own sequential test; None: with limits for the recording's reference.
     """
-    tuning, noise, walk, watch = baseline.tuning, None, None, None
-    if baseline.healthy.noise is not None:
-        noise = baseline.healthy.noise.times(np.sqrt(growth))
+    tuning, noise, walk, watch = baseline.tuning, baseline.healthy.noise, None, None
+    noise = None if noise is None else noise.times(np.sqrt(growth))
     if run is not None:
         walk = None if run.mean is None else run.mean.again()
     elif noise is None:
@@ -342,11 +339,8 @@ def _run_recursion(
         walk = expectation.propagator(np.array(baseline.healthy.theta), baseline.plant)
 
     def healthy(rows: slice) -> FloatArray:
-        if walk is None:
-            return tuning.theta
-        return np.asarray(
-            walk.advance(_reference_piece(recording, rows, 0)) + (tuning.theta - np.array(baseline.healthy.theta))
-        )
+        moved = tuning.theta - np.array(baseline.healthy.theta)
+        return tuning.theta if walk is None else walk.advance(_reference_piece(recording, rows, 0)) + moved
 
     started = tuning if along is None else replace(tuning, theta=along.start)
     estimating = EstimationRunner(pipeline, started, watch) if run is None else run.estimates.again()
@@ -372,10 +366,9 @@ def _run_recursion(
             outofcore.release(*recording.columns)
         if kept is not None:
             kept.result()
-    found = {name: column.to_array() for name, column in columns.items()}
-    expected, T2 = found.pop("expected"), found.pop("statistic")
-    estimates = Estimates(**found)
-    return Examination(baseline, recording, pipeline, tuning, estimates, noise, expected, T2, 0.0, growth)
+    arrays = {name: column.to_array() for name, column in columns.items()}
+    expected, T2 = arrays.pop("expected"), arrays.pop("statistic")
+    return Examination(baseline, recording, pipeline, tuning, Estimates(**arrays), noise, expected, T2, 0.0, growth)
 
 
 def _noise_growth(pipeline: Pipeline, estimates: Estimates) -> float:

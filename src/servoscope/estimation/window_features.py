@@ -16,15 +16,13 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
+from servoscope.estimation.window_state import HEADER, ROW_HEADER
 
 MOTIONS = ("forward", "backward", "rest")
 SIGNALS = ("u", "e")
-MAX_PHYSICAL = 1e100  # as in the recursion: no physical signal, and it would stay in the filters for ever
 SPEED_TIME = 0.02  # s: time constant behind the speed of the reference
 MIN_POSITIVE = np.finfo(np.float64).tiny
 MIN_MOTION_SAMPLES = 3  # samples of a motion from which a window speaks for it
-HEADER = 8  # numbers of the state before those of the filters; see `accumulate_windows`
-ROW_HEADER = 3  # numbers of a row before the sums: sample, level, span
 
 
 class FeatureLayout(BaseModel):
@@ -106,9 +104,8 @@ class WindowFeatures:
         edges = np.array(layout.edges_s, dtype=np.float64) * layout.sample_rate
         counts = [layout.window, layout.levels, layout.span, layout.settling, edges.size, b.size]
         numbers = [layout.rest_speed, layout.sample_rate, float(smoothing)]
-        self.constants = np.concatenate(
-            [counts, numbers, edges, b, a[:, 0], a[:, 1]]
-        )  # as `accumulate_windows` takes them
+        # as `accumulate_windows` takes them
+        self.constants = np.concatenate([counts, numbers, edges, b, a[:, 0], a[:, 1]])
         bins, powers = 3 * layout.bins, 3 * layout.bins + 2 * len(MOTIONS) * layout.bands
         self._parts = slice(layout.bins), slice(layout.bins, bins), slice(bins, powers), slice(powers, None)
         self._floors = np.array(layout.floors)[:, None, None]

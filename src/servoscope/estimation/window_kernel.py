@@ -6,7 +6,7 @@ import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.jit.loops import kernel
-from servoscope.estimation.window_features import HEADER, MAX_PHYSICAL, ROW_HEADER
+from servoscope.estimation.window_state import HEADER, MAX_PHYSICAL, ROW_HEADER
 
 
 @kernel
@@ -92,10 +92,6 @@ def accumulate_windows(
 
     See `WindowLanes.run` for the arguments; `out`, `lane`: rows of windows and whose they are.
     """
-    # a row of constants: window, levels, span, settling, number of edges, number of bands, speed of rest, rate,
-    # smoothing; then edges [samples], b and both a of the band-pass filters
-    # a state: armed, sample, samples of the window, windows of the span, span, reference before, speed, 4 times the
-    # samples since the motion began plus the motion; then filters, then sums level by level
     rows, lanes = 0, 2 * int(table[:, 5].max())
     weights, filters, square = np.zeros((4, lanes)), np.zeros((4, lanes)), np.zeros((4, lanes))
     for asset in range(len(table)):

@@ -152,9 +152,8 @@ def _evaluate_group(
         return -np.inf, Cause(key, group, tuple(assets), (0.0,) * len(assets), 0.0, "", 0.0, 1.0, (1.0, 1.0))
     arrays = [_evidence_arrays(evidence[i]) for i in alike]
     likelihoods = [_member_log_likelihoods(*array, prior) for array in arrays]
-    together = np.sum(
-        [np.logaddexp(*both) for both in likelihoods], axis=0
-    )  # log-likelihood of (f, s), shape (m, sizes)
+    # log-likelihood of (f, s), shape (m, sizes)
+    together = np.sum([np.logaddexp(*both) for both in likelihoods], axis=0)
     posterior = together + _log_prior(prior.size)
     by_parameter = _log_sum(posterior)
     evident, apart = _log_sum(by_parameter), _log_sum(_log_sum(together + _log_prior(prior.drift)))

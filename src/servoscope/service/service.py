@@ -234,17 +234,11 @@ class Service:
             return
         now, examination = self.clock.now(), asset.state.examination
         for transition in result.transitions:
-            words = {
-                "asset": transition.asset,
-                "alarm": transition.alarm,
-                "before": str(transition.before),
-                "after": str(transition.after),
-            }
+            words = {name: str(getattr(transition, name)) for name in ("asset", "alarm", "before", "after")}
             log("info", "alarm", **words, cause=transition.cause, who=transition.who, t=transition.time)
             if transition.alarm == "fault" and transition.event == "clear":
-                self.writer.add(
-                    self.config.name, self.notifier.accommodate_fault(asset.name, None, transition.time, now)
-                )
+                rows = self.notifier.accommodate_fault(asset.name, None, transition.time, now)
+                self.writer.add(self.config.name, rows)
         details = {"diagnosis": examination.summary, "onset": examination.onset}
         self.writer.add(self.config.name, self.notifier.notify(result.transitions, details, now))
 

@@ -65,9 +65,7 @@ def list_channels(path: str | Path, text: TextLayout | None = None) -> list[Chan
 
 
 def _channel_info(name: str, types: list[str], ranges: list[tuple[float, float]]) -> ChannelInfo:
-    kind = next(
-        (candidate for candidate in ("string", "double") if candidate in types), types[0]
-    )  # what the whole column would be
+    kind = next((kind for kind in ("string", "double") if kind in types), types[0])  # what the whole column would be
     if not ranges or (kind == "string" and len(ranges) < len(types)):
         return ChannelInfo(name, kind, float("nan"), float("nan"))
     return ChannelInfo(name, kind, min(low for low, _ in ranges), max(high for _, high in ranges))
