@@ -82,8 +82,7 @@ class Examination:
             )
         along, pipeline = None, baseline.pipeline()
         if (model := baseline.covariates) is not None:
-            memory = pipeline.memory_samples
-            theta = np.array(baseline.theta)
+            memory, theta = pipeline.memory_samples, np.array(baseline.theta)
             if model.warm_up is None:
                 along = CovariatePath.of(model, theta, recording.channels, memory)
             else:
@@ -97,8 +96,7 @@ class Examination:
             baseline = baseline.model_copy(update=followed)
         exam = _run_quickly(baseline, recording) if quick and along is None else None
         exam = exam or _run_recursion(baseline, recording, pipeline, along)
-        skipped = exam.estimates.skipped_share
-        replaced = _has_failed_instrument(exam)
+        skipped, replaced = exam.estimates.skipped_share, _has_failed_instrument(exam)
         if replaced or skipped > MAX_SKIPPED_SHARE:
             other = loop.model_copy(update={"monitor": loop.monitor.model_copy(update=FALL_BACK)})
             pipeline = Pipeline.of(other, baseline.recursion.stage_one, baseline.recursion.still_speed)
