@@ -161,7 +161,7 @@ def main() -> None:
             tuple(halves),
         ),
     ]
-    show(tables, given.json)
+    show(tables, given.json, {f"{score.name}.found": row[2] for score, row in zip(scores, summary, strict=True)})
 
 
 if __name__ == "__main__":
