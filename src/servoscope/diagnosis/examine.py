@@ -124,8 +124,9 @@ class Examination:
     def release(self) -> None:
         """Free the memory of a recording and of estimates that lie in files; they are read again where needed."""
         moved = () if self.motion is None else (self.motion.sums, self.motion.updates)
-        estimated = (*vars(self.estimates).values(), self.statistic, self.expected)
-        outofcore.release(*self.recording.columns, *estimated, *moved)
+        outofcore.release(
+            *self.recording.columns, *vars(self.estimates).values(), self.statistic, self.expected, *moved
+        )
 
     @property
     def evaluations(self) -> int:
@@ -337,8 +338,9 @@ def _run_recursion(
         walk = expectation.propagator(np.array(baseline.healthy.theta), baseline.plant)
 
     def healthy(rows: slice) -> FloatArray:
-        moved = tuning.theta - np.array(baseline.healthy.theta)
-        return tuning.theta if walk is None else walk.advance(_reference_piece(recording, rows, 0)) + moved
+        if walk is None:
+            return tuning.theta
+        return walk.advance(_reference_piece(recording, rows, 0)) + (tuning.theta - np.array(baseline.healthy.theta))
 
     started = tuning if along is None else replace(tuning, theta=along.start)
     estimating = EstimationRunner(pipeline, started, watch) if run is None else run.estimates.again()
