@@ -71,7 +71,6 @@ class Examination:
 
         `quick`: whether features and residual are left out, and the sequential test may be held against the baseline's
         own limits where neither these nor those for the recording's reference, which take far longer, raise an alarm.
-
         Raises RecordingError if the recording's sample rate is not the loop's.
         """
         loop = baseline.loop
@@ -124,9 +123,8 @@ class Examination:
     def release(self) -> None:
         """Free the memory of a recording and of estimates that lie in files; they are read again where needed."""
         moved = () if self.motion is None else (self.motion.sums, self.motion.updates)
-        outofcore.release(
-            *self.recording.columns, *vars(self.estimates).values(), self.statistic, self.expected, *moved
-        )
+        estimated = (*vars(self.estimates).values(), self.statistic, self.expected)
+        outofcore.release(*self.recording.columns, *estimated, *moved)
 
     @property
     def evaluations(self) -> int:
