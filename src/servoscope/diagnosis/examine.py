@@ -338,7 +338,8 @@ def _run_recursion(
     def healthy(rows: slice) -> FloatArray:
         if walk is None:
             return tuning.theta
-        return walk.advance(_reference_piece(recording, rows, 0)) + (tuning.theta - np.array(baseline.healthy.theta))
+        piece = _reference_piece(recording, rows, 0)
+        return np.asarray(walk.advance(piece) + (tuning.theta - np.array(baseline.healthy.theta)))
 
     started = tuning if along is None else replace(tuning, theta=along.start)
     estimating = EstimationRunner(pipeline, started, watch) if run is None else run.estimates.again()
@@ -395,6 +396,5 @@ def _has_failed_instrument(exam: Examination) -> bool:
         g = runner.advance(part.r, part.u, part.y, part.restart)
         z, phi = g.z[g.ok] / scale, g.phi[g.ok] / scale
         own, shared = own + z.T @ z, shared + z.T @ phi
-    if not own.any():
-        return False
-    return bool(np.linalg.eigvals(np.linalg.lstsq(own, shared, rcond=None)[0]).real.min() < MIN_INSTRUMENT_EIGENVALUE)
+    moved = np.linalg.lstsq(own, shared, rcond=None)[0]
+    return bool(own.any() and np.linalg.eigvals(moved).real.min() < MIN_INSTRUMENT_EIGENVALUE)
