@@ -38,6 +38,7 @@ CYLINDER = {"kind": "cylinder", "terms": ["spring", "process", "overlap", "offse
 PLANTS: dict[str, dict[str, object]] = {
     "cylinder": CYLINDER,
     "cylinder, oil temperature logged": CYLINDER,
+    "cylinder, pressures logged": {**CYLINDER, "pressures": {"A": "p_A", "B": "p_B", "supply": "p_S"}},
 }
 # by fault of the rig: what a diagnosis may call it
 NAMES: dict[str, set[str]] = {
@@ -111,9 +112,19 @@ def main() -> None:
         note = f"Learned: {len(healthy)} {'mixed' if given.mixed else 'production'} days of a minute at {RATE:g} Hz."
         tables.append(Table(f"Cylinder, plant {words}", note, heads, tuple(rows(days, found, named, simple))))
         faults = [k for k, day in enumerate(days) if day.fault in FAULTS]
+        supplies = [
+            (fault, days[k].size)
+            for k in faults
+            if days[k].fault == "supply"
+            for candidate in told[k].candidates[:1]
+            for fault in candidate.faults
+        ]
+        holds = [f.name == "supply" and f.interval[0] <= size <= f.interval[1] for f, size in supplies]
         process = [names for names, day in zip(named, days, strict=True) if day.fault == "process"]
         values |= {
             f"{words}.process": f"{sum(names == {'process_force'} for names in process)}",
+            f"{words}.supply": f"{sum(holds)}",
+            f"{words}.leakage": f"{sum(named[k] == {'leakage'} for k in faults if days[k].fault == 'leakage')}",
             f"{words}.false": f"{sum(x for x, day in zip(found, days, strict=True) if not day.fault)}",
             f"{words}.found": f"{sum(found[k] for k in faults)}",
             f"{words}.right": f"{sum(bool(named[k]) and named[k] <= NAMES.get(days[k].fault, set()) for k in faults)}",
