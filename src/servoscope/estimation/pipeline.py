@@ -186,7 +186,8 @@ class Pipeline:
         if bank.has_instrument:
             rows[1 + bank.n :, 1 + bank.n :] = basis.T
         rows[0] -= theta @ rows[1 : 1 + bank.n]
-        dead = loop.input_deadzone or (np.inf, -np.inf)
+        edges = np.array([loop.input_deadzone or (np.inf, -np.inf), loop.input_limits or (-np.inf, np.inf)])
+        dead, limits = map(tuple, loop.plant.effective_input(edges).tolist())
         unlimited = loop.input_logged == "after_limiter" or self.valve.size  # a valve law limits u itself
         lags, heads = tuning.noise.chain()
         return RecursionConstants(
@@ -197,7 +198,7 @@ class Pipeline:
             v_of_r=bank.velocity_of_reference,
             nonlinear=bank.extras,
             shapes=tuple(x for extra in bank.extras for x in loop.plant.column_shapes.get(extra, ())),
-            limits=(-np.inf, np.inf) if unlimited else (loop.input_limits or (-np.inf, np.inf)),
+            limits=(-np.inf, np.inf) if unlimited else limits,
             deadzone=dead,
             sign_speed=loop.plant.velocity_sign.dead_speed,
             rest_speed=loop.monitor.rest_speed,

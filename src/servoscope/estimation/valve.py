@@ -38,6 +38,7 @@ class ValveConstants(NamedTuple):
     low: float
     high: float
     sign: float
+    area_ratio: float  # of the rod's side over the other
     delay: int  # samples
 
 
@@ -50,7 +51,7 @@ class ValveLaw:
     """The valve law of one loop, ready to run; where the law is linear it lets u pass and has no state."""
 
     def __init__(self, loop: Loop) -> None:
-        self.size = 0
+        self.size, self._plant = 0, loop.plant
         if loop.plant.load_pressure is None:
             return
         rate, (of_y, *of_derivatives) = loop.sample_rate, loop.plant.load_pressure
@@ -68,6 +69,7 @@ class ValveLaw:
             low=low,
             high=high,
             sign=math.copysign(1.0, loop.plant.input_gain),
+            area_ratio=loop.plant.retraction_gain**2,
             delay=split_delay(loop.delay, rate)[0],
         )
         self.size = HEADER_SIZE + len(filtered.A) + self._constants.delay
@@ -82,7 +84,7 @@ class ValveLaw:
         It is NaN where u or y is. After a gap, axis and u are assumed to have been constant before.
         """
         if not self.size:
-            return u
+            return self._plant.effective_input(u)
         out = np.empty(len(u))
         _run_square_root(self._constants, state, u, y, restart, out, n=len(self._constants.X0))
         return out
@@ -111,5 +113,5 @@ def _run_square_root(
                 s[HEADER_SIZE + i] = sum_products([c.A[i, j] for j in range(n)], x, c.B[i] * y[k])
             for i in printer.loop(0, c.delay):
                 now.value, s[i + past] = s[i + past], now.value
-            left = where(c.sign * now.value > 0.0, 1.0 - pressure, 1.0 + pressure)
+            left = where(c.sign * now.value > 0.0, 1.0 - pressure, c.area_ratio + pressure)
             out[k] = now.value * sqrt(maximum(left, 0.0))

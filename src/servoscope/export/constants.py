@@ -148,6 +148,8 @@ def _input_stage(baseline: Baseline) -> str:
     loop = baseline.loop
     if loop.monitor.two_stage != "none":
         return f"[monitor] two_stage = {loop.monitor.two_stage!r}"
+    if loop.plant.retraction_gain != 1.0:
+        return "[plant] A_b"
     return "[plant] valve_law = 'square-root'" if loop.plant.load_pressure else ""
 
 

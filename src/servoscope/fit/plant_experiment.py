@@ -198,10 +198,10 @@ def samples_since(restart: BoolArray) -> IndexArray:
 
 
 def plant_input(loop: Loop, u: FloatArray) -> FloatArray:
-    """Return what acted on the plant, shape (N,): u within its limits, and nothing inside the dead zone."""
+    """Return what acted on the plant, (N,): u within limits, nothing inside the dead zone, less on the rod's side."""
     if loop.input_logged == "before_limiter" and loop.input_limits is not None:
         u = np.clip(u, *loop.input_limits)
     if loop.input_deadzone is not None:
         low, high = loop.input_deadzone
         u = np.where((u >= low) & (u <= high), 0.0, u)
-    return u
+    return loop.plant.effective_input(u)

@@ -38,6 +38,8 @@ class ControllerConstants(NamedTuple):
     deadzone_high: float
     delay_samples: int  # whole samples of the delay
     delay_fraction: float  # and the rest of it, 0 to 1 sample
+    negative_gain: float = 1.0  # negative_gain, positive_gain: what u < 0 and u > 0 act by, with two areas
+    positive_gain: float = 1.0
 
 
 class AxisConstants(NamedTuple):
@@ -70,7 +72,8 @@ def control_step(
     limited = minimum(maximum(u, settings.low), settings.high)
     passed = where((limited >= settings.deadzone_low) & (limited <= settings.deadzone_high), 0.0, limited)
     e = r - n_y - free - share * (passed + n_u)
-    return gain * e + total, limited, passed + n_u, total + settings.integral_gain * e
+    acting = passed * where(passed < 0.0, settings.negative_gain, settings.positive_gain) + n_u
+    return gain * e + total, limited, acting, total + settings.integral_gain * e
 
 
 def runge_kutta_step(x: Any, states: int, h: Any, slope: Callable[[Sequence[Any]], Sequence[Any]]) -> None:

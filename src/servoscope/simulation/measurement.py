@@ -81,7 +81,11 @@ def controller_constants(loop: Loop) -> ControllerConstants:
     k_p, integral_gain = controller_gains(loop)
     low, high = loop.input_limits or (-np.inf, np.inf)
     deadzone = loop.input_deadzone or (np.inf, -np.inf)
-    return ControllerConstants(k_p, integral_gain, low, high, *deadzone, *split_delay(loop.delay, loop.sample_rate))
+    delay, backward = split_delay(loop.delay, loop.sample_rate), loop.plant.retraction_gain
+    if backward != 1.0 and loop.hold != "zoh":
+        raise SimulationError(f"loop {loop.name!r}: two areas are simulated with a held u, set hold = 'zoh'")
+    gains = (backward, 1.0) if loop.plant.input_gain > 0.0 else (1.0, backward)
+    return ControllerConstants(k_p, integral_gain, low, high, *deadzone, *delay, *gains)
 
 
 class FeedForward:

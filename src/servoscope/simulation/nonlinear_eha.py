@@ -163,12 +163,13 @@ def simulate_rig(
     temperature = rig.temperature + rig.warming * -np.expm1(-t / rig.warming_time)
     parameters = _parameters(plant, plan, rig, temperature)
     n_u, n_y = draw_noise(r.size, noise_u_std, noise_y_std, seed)
-    settings = controller_constants(loop)
+    settings = _without_areas(controller_constants(loop))
     limit = np.inf if rig.current_limit is None else rig.current_limit
     settings = settings._replace(low=max(settings.low, -limit), high=min(settings.high, limit))
     supply, leakage, friction, beta = parameters.values()
-    leakage = leakage + plant.K_c
-    rows = np.column_stack([_flow_gain(plant, supply), 1.0 / supply, leakage, friction, 2.0 * beta / plant.V_o])
+    leakage = plant.leakage_share * leakage + plant.K_c
+    stiffness = (1.0 + plant.area_ratio**2) * beta / plant.V_o
+    rows = np.column_stack([_flow_gain(plant, supply), 1.0 / supply, leakage, friction, stiffness])
     physics, past = _rig_constants(plant, rig, loop, rows), settings.delay_samples + 2
     u, limited, y = np.empty((3, r.size))
     acting = np.zeros(past + r.size)
@@ -194,13 +195,24 @@ def nonlinear_run(loop: Loop, plants: Sequence[Plant], settings: ControllerConst
 
     _check_hold(loop)
     actuators = [plant for plant in plants if isinstance(plant, EHA)]
-    rows = np.array([[_flow_gain(p, p.p_s), 1.0 / p.p_s, p.C_ie + p.K_c, p.b_p, 1.0 / p.capacity] for p in actuators])
+    losses = [p.leakage_share * p.C_ie + p.K_c for p in actuators]
+    rows = np.array(
+        [
+            [_flow_gain(p, p.p_s), 1.0 / p.p_s, lost, p.b_p, 1.0 / p.capacity]
+            for p, lost in zip(actuators, losses, strict=True)
+        ]
+    )
     first = actuators[0]
     rig = replace(
         Rig.ideal(), load_pressure_flow=first.load_pressure is not None, coulomb=first.coulomb, static=first.coulomb
     )
     physics = _rig_constants(first, rig, loop, rows)
-    return lambda which, *signals: run_rig(physics, settings, rows[which], *signals)
+    return lambda which, *signals: run_rig(physics, _without_areas(settings), rows[which], *signals)
+
+
+def _without_areas(settings: ControllerConstants) -> ControllerConstants:
+    """Return settings under which u is the same in both directions: the rig tells them by its spool."""
+    return settings._replace(negative_gain=1.0, positive_gain=1.0)
 
 
 def _check_hold(loop: Loop) -> None:
@@ -257,6 +269,7 @@ def _rig_constants(plant: EHA, rig: Rig, loop: Loop, rows: FloatArray) -> RigCon
         stiffness=plant.k_p,
         area=plant.A_p,
         square_root=rig.load_pressure_flow,
+        area_ratio=plant.area_ratio,
         coulomb=rig.coulomb,
         breakaway=rig.static - rig.coulomb,
         stribeck_speed=rig.stribeck_speed,

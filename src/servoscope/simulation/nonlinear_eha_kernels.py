@@ -28,6 +28,7 @@ class RigConstants(NamedTuple):
     stiffness: float
     area: float
     square_root: bool
+    area_ratio: float  # of the rod's side over the other
     coulomb: float
     breakaway: float  # static friction beyond Coulomb friction
     stribeck_speed: float
@@ -46,9 +47,12 @@ def derivative(printer: Any, p: RigConstants, row: Any, drive: Any, x: Sequence[
     has_valve = p.valve > 0.0
     spool = where(has_valve, x[3], drive)
     flow, friction = row[0] * spool, Variable(printer, row[3] * speed)
+    extends = flow > 0.0
     if p.square_root:
-        left = where(spool > 0.0, 1.0 - pressure * row[1], 1.0 + pressure * row[1])
+        left = where(extends, 1.0 - pressure * row[1], p.area_ratio + pressure * row[1])
         flow = flow * where(left >= 0.0, sqrt(left), -sqrt(-left))
+    else:
+        flow = flow * where(extends, 1.0, sqrt(p.area_ratio))
     with printer.when(p.coulomb + p.breakaway > 0.0):
         ratio = speed / p.stribeck_speed
         stribeck = p.coulomb + p.breakaway * printer.call_library("exp", -ratio * ratio)

@@ -163,6 +163,16 @@ class Plant(BaseModel, abc.ABC):
         return None
 
     @property
+    def retraction_gain(self) -> float:
+        """What u < 0 does over what u > 0 does, by which it acts."""
+        return 1.0
+
+    def effective_input(self, u: FloatArray) -> FloatArray:
+        """Return what u acts like if both directions were alike, same shape."""
+        gain = self.retraction_gain
+        return u if gain == 1.0 else np.where(u * self.input_gain < 0.0, gain * u, u)
+
+    @property
     def units(self) -> tuple[str, str]:
         """Units of y and u; empty where they depend on the machine."""
         return "", ""

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.settings import NonNegative
@@ -54,6 +54,10 @@ class EHA(Plant):
         m_p y'' = A_p p_L - b_p y' - k_p y
         V_o/(2 beta) p_L' = K_q u - (C_ie + K_c) p_L - A_p y',   K_q = K_m C_d W sqrt(p_s/rho)
         1/G(s) = ((V_o/(2 beta) s + C_ie + K_c)(m_p s^2 + b_p s + k_p) + A_p^2 s)/(A_p K_q)      (1), (2)
+
+    With a smaller area a A_p on the rod's side, p_L = p_A - a p_B. In steady motion the edges of the valve share the
+    pressure so that K_q grows by sqrt(2/(1 + a^3)) for u > 0 and by sqrt(a) of that for u < 0; leakage grows by
+    (1 + a)/(1 + a^3), and V_o/(2 beta) becomes V_o/((1 + a^2) beta) (Jelali and Kroll, 2003, chapter 4).
     """
 
     names: ClassVar[tuple[str, ...]] = ("theta_0", "theta_1", "theta_2", "theta_3")
@@ -68,7 +72,9 @@ class EHA(Plant):
     m_p: PlausiblePositive  # mass [kg]
     b_p: PlausiblePositive  # viscous friction [N s/m]
     k_p: NonNegative  # stiffness of the load [N/m]; 0 for a cylinder without a spring, whose theta_0 is 0
-    A_p: PlausiblePositive  # piston area [m^2]
+    A_p: PlausiblePositive  # piston area [m^2], that which u > 0 fills
+    # area of the rod's side [m^2]; None: both are A_p
+    A_b: Annotated[PlausiblePositive | None, Field(exclude_if=lambda value: value is None)] = None
     V_o: PlausiblePositive  # oil volume [m^3]
     beta: PlausiblePositive  # bulk modulus of the oil [Pa]
     C_ie: PlausiblePositive  # leakage [m^3/(s Pa)]
@@ -85,6 +91,37 @@ class EHA(Plant):
     # coulomb friction [N] beside b_p y'. Simulations know it, and with them expectations and signatures; the
     # coefficients do not.
     coulomb: NonNegative = 0.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _areas_of_diameters(cls, data: Any) -> Any:
+        """Take ``bore`` and ``rod`` [m], as data sheets have them, for the areas."""
+        if not isinstance(data, Mapping) or not {"bore", "rod"} & data.keys():
+            return data
+        values = {key: data.get(key) for key in ("bore", "rod")}
+        sizes = [value for value in values.values() if isinstance(value, int | float)]
+        if len(sizes) < len(values) or not 0.0 <= sizes[1] < sizes[0] or {"A_p", "A_b"} & data.keys():
+            raise ValueError("bore, rod: give both diameters [m], bore the larger, in the place of A_p and A_b")
+        quarter = math.pi / 4.0
+        areas = {"A_p": quarter * sizes[0] ** 2, "A_b": quarter * (sizes[0] ** 2 - sizes[1] ** 2)}
+        return {key: value for key, value in data.items() if key not in values} | areas
+
+    @model_validator(mode="after")
+    def _rod_takes_area(self) -> Self:
+        if self.A_b is not None and self.A_b > self.A_p:
+            raise ValueError("A_b: must not be larger than A_p, the side that u > 0 fills: turn the sign of input_gain")
+        return self
+
+    @property
+    def area_ratio(self) -> float:
+        """The rod's area over the other."""
+        ratio: float = 1.0 if self.A_b is None else self.A_b / self.A_p
+        return ratio
+
+    @property
+    def retraction_gain(self) -> float:
+        """The flow for u < 0 over that for u > 0, at no load."""
+        return float(np.sqrt(self.area_ratio))
 
     @property
     def error_factors(self) -> Mapping[str, float]:
@@ -106,18 +143,24 @@ class EHA(Plant):
 
     @property
     def flow_gain(self) -> float:
-        """K_q = K_m C_d W sqrt(p_s/rho) [m^3/(s A)]."""
-        flow_gain: float = self.K_m * self.C_d * self.W * np.sqrt(self.p_s / self.rho)  # complex where `scaled` was
+        """K_q = K_m C_d W sqrt(p_s/rho) [m^3/(s A)], for u > 0 and two areas as the class says."""
+        both = np.sqrt(2.0 / (1.0 + self.area_ratio**3))
+        flow_gain: float = self.K_m * self.C_d * self.W * np.sqrt(self.p_s / self.rho) * both  # complex as `scaled` is
         return flow_gain
 
     @property
     def capacity(self) -> float:
-        """Hydraulic capacity V_o/(2 beta) [m^3/Pa]."""
-        return self.V_o / (2.0 * self.beta)
+        """Hydraulic capacity V_o/(2 beta) [m^3/Pa], V_o/((1 + a^2) beta) with two areas."""
+        return self.V_o / ((1.0 + self.area_ratio**2) * self.beta)
+
+    @property
+    def leakage_share(self) -> float:
+        """What of C_ie is lost by p_L: more than all with two areas."""
+        return (1.0 + self.area_ratio) / (1.0 + self.area_ratio**3)
 
     def theta(self) -> FloatArray:
         """Coefficients of 1/G, shape (4,) [A/m, A s/m, A s^2/m, A s^3/m], eq. (2)."""
-        capacity, leakage = self.capacity, self.C_ie + self.K_c
+        capacity, leakage = self.capacity, self.leakage_share * self.C_ie + self.K_c
         coefficients = [
             leakage * self.k_p,
             capacity * self.k_p + leakage * self.b_p + self.A_p**2,
@@ -127,8 +170,11 @@ class EHA(Plant):
         return np.array(coefficients) / (self.A_p * self.flow_gain)
 
     def scaled(self, factors: Mapping[str, Any]) -> Self:
-        """Return the same plant with any of the twelve parameters multiplied."""
-        return self.model_copy(update={name: getattr(self, name) * factor for name, factor in factors.items()})
+        """Return the same plant with any of the twelve parameters multiplied, both areas alike."""
+        moved = {name: getattr(self, name) * factor for name, factor in factors.items()}
+        if self.A_b is not None and "A_p" in factors:
+            moved["A_b"] = self.A_b * factors["A_p"]
+        return self.model_copy(update=moved)
 
     def state_space(self) -> StateSpace:
         """Return A (3, 3), B (3, 1), C (1, 3), states y [m], y' [m/s], p_L [Pa]; integrates if k_p = 0.
@@ -145,7 +191,7 @@ class EHA(Plant):
         A = [
             [0.0, 1.0, 0.0],
             [-eha.k_p / m_p, -eha.b_p / m_p, eha.A_p / m_p],
-            [0.0, -eha.A_p / capacity, -(eha.C_ie + eha.K_c) / capacity],
+            [0.0, -eha.A_p / capacity, -(eha.leakage_share * eha.C_ie + eha.K_c) / capacity],
         ]
         B = [[0.0], [0.0], [eha.input_gain * eha.flow_gain / capacity]]
         return matrices(A, count), matrices(B, count), matrices([[1.0, 0.0, 0.0]], count)
