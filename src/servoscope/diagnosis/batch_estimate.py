@@ -11,9 +11,9 @@ from servoscope.baseline.expectation import Expectation, reference_path
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError, RecordingError
 from servoscope.detection.onset import Onset
-from servoscope.diagnosis.examine import Examination
 from servoscope.estimation.instrumental_fit import InstrumentalFit, fit_with_instrument
 from servoscope.estimation.tuning import fit_tuning
+from servoscope.evidence.examination import Examination
 from servoscope.isolation.signature import Signature
 from servoscope.isolation.signatures import fault_signatures
 

@@ -23,7 +23,7 @@ from servoscope.service.sources.block import Block
 from servoscope.signals import Recording, clean
 
 if TYPE_CHECKING:  # its kernels are loaded when something is examined
-    from servoscope.diagnosis.examine import Examination
+    from servoscope.evidence.examination import Examination
 
 
 KERNEL_SAMPLES = 400  # that bring all kernels of an examination to work
@@ -104,15 +104,16 @@ def examine_blocks(
         result = examine_blocks(baseline, name, blocks, features, fault, known)
         return result.model_copy(update={"control": _assess_blocks(baseline, name, blocks)})
     from servoscope.diagnosis.diagnose import diagnose_examination, judge_without_alarm
-    from servoscope.diagnosis.examine import Examination
+    from servoscope.evidence.examination import Examination
+    from servoscope.evidence.kinds import findings
 
     try:
         recording, start = blocks_to_recording(baseline, name, blocks)
         exam = Examination.from_recording(baseline, recording, quick=True)
     except ServoscopeError as error:
         return undetermined("unusable", error=str(error))
-    if exam.along is not None and (outside := exam.along.outside) is not None:
-        return undetermined("unusable", error=outside)
+    if (reason := next(findings(exam, "undetermined"), None)) is not None:
+        return undetermined("unusable", error=reason.text)
     if not exam.alarm.any():
         if features is not None and features > 1.0:
             headline = message("service.examination.features", excess=features)

@@ -24,22 +24,21 @@ from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import RecordingError
 from servoscope.detection import cusum_design
-from servoscope.detection.baseline_run import BaselineRun, baseline_run, cusum_constants
+from servoscope.detection.baseline_run import BaselineRun, baseline_run, cusum_constants, has_failed_instrument
+from servoscope.detection.feature_evidence import FeatureEvidence
+from servoscope.detection.louder_noise import noise_growth
 from servoscope.detection.statistic import apply_alarm_delays, t2_statistic
 from servoscope.detection.trace import UNSEEN_EXCESS, Statistic, any_exceeded, detection_statistics
 from servoscope.detection.warm_up import follow_warm_up
-from servoscope.diagnosis.feature_evidence import FeatureEvidence
 from servoscope.estimation.noise_model import WhiteNoise
-from servoscope.estimation.pipeline import Estimates, EstimationRunner, Pipeline, RegressionRunner, Tuning
+from servoscope.estimation.pipeline import Estimates, EstimationRunner, Pipeline, Tuning
 from servoscope.isolation.ml.axis_scan import AxisChange
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 from servoscope.simulation import closed_loop_poles
 
 MAX_SKIPPED_SHARE = 0.2  # share of updates that an estimator's guard may skip before the AKF takes over
-MIN_INSTRUMENT_EIGENVALUE = 0.05  # of 1; below, the recursion follows too slowly, and below 0 it runs away
 FALL_BACK = {"estimator": "akf"}
-MIN_NOISE_GROWTH = 1.5  # of the variance; below it counts as none
 MAX_COVARIATE_T2 = 1.0  # T^2 of what covariates do within a recording, from which on no single plant explains it
 AT_ONCE = 4096  # evaluations
 FORGOTTEN_SHARE = 1e-9  # share of the past below which it counts as forgotten
@@ -98,12 +97,13 @@ class Examination:
         exam = _run_quickly(baseline, recording) if quick and along is None else None
         exam = exam or _run_recursion(baseline, recording, pipeline, along)
         skipped = exam.estimates.skipped_share
-        replaced = _has_failed_instrument(exam)
+        own = baseline.recursion.instrument is not None
+        replaced = not own and has_failed_instrument(exam.pipeline, exam.tuning, recording)
         if replaced or skipped > MAX_SKIPPED_SHARE:
             other = loop.model_copy(update={"monitor": loop.monitor.model_copy(update=FALL_BACK)})
             pipeline = Pipeline.of(other, baseline.recursion.stage_one, baseline.recursion.still_speed)
             exam = _run_recursion(baseline, recording, pipeline, along)
-        growth = 1.0 if exam.noise is None else _noise_growth(exam.pipeline, exam.estimates)
+        growth = 1.0 if exam.noise is None else noise_growth(exam.pipeline, exam.estimates)
         if growth > 1.0:  # it shifts the expectation, and the sequential test would take it for steps of a change
             exam = _run_recursion(baseline, recording, exam.pipeline, along, growth)
         change, exam = None, exam if along is None else replace(exam, along=along)
@@ -193,16 +193,34 @@ class Examination:
         """Whether there was an alarm of the coefficients that a motion never seen does not explain, shape (K,)."""
         if not self.apparent_alarm.any() or self.motion is None:  # in this order: the motion takes a second reading
             return self.apparent_alarm
-        exceeded = np.zeros(self.evaluations, dtype=np.bool_)
+        exceeded, seen = np.zeros((2, self.evaluations), dtype=np.bool_)
         e, limit = self.estimates, self.baseline.thresholds.statistic
         for at in outofcore.iter_chunks(0, self.evaluations, e.theta, e.S, at_once=AT_ONCE):
-            C = self.covariance(at) + self.model_error(at)
-            T2 = np.where(self.ready[at], t2_statistic(e.theta[at], self.expected[at], C), 0.0)
+            C, excess = self.covariance(at), self.motion_excess(at)
+            T2 = np.where(self.ready[at], t2_statistic(e.theta[at], self.expected[at], C + self.model_error(at)), 0.0)
             # the sequential test knows no model error
-            exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & (self.motion_excess(at) < UNSEEN_EXCESS))
+            exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & (excess < UNSEEN_EXCESS))
+            seen[at] = excess < UNSEEN_EXCESS
+            if self.baseline.axis is not None:  # its terms are those of physics, and hold as far as they are known
+                told = self.motion.tells(e.theta[at] - self.expected[at], C, at)
+                exceeded[at] |= told
+                seen[at] |= told
         exceeded &= any_exceeded(self.statistics[:2])
         self.release()
-        return self._changed | apply_alarm_delays(exceeded, *self.pipeline.delays)
+        vibrates = self.change is not None and self.change.vibration is not None
+        changed = self._changed & (vibrates or (self._changed & seen).any())
+        return changed | apply_alarm_delays(exceeded, *self.pipeline.delays)
+
+    @property
+    def explained(self) -> int:
+        """The evaluation that an explanation is about; the last one has forgotten most of the healthy past.
+
+        Where an alarm has gone, the one after its beginning at which T^2 is largest.
+        """
+        if not self.alarm.any() or self.alarm[-1]:
+            return self.evaluations - 1
+        first = int(self.alarm.argmax())
+        return first + int(np.argmax(self.statistic[first:]))
 
     @cached_property
     def motion(self) -> RecordedMotion | None:
@@ -367,34 +385,3 @@ def _run_recursion(
     expected, T2 = found.pop("expected"), found.pop("statistic")
     estimates = Estimates(**found)
     return Examination(baseline, recording, pipeline, tuning, estimates, noise, expected, T2, 0.0, growth)
-
-
-def _noise_growth(pipeline: Pipeline, estimates: Estimates) -> float:
-    """Return the growth of the noise's variance against the baseline's, 1 where it has not grown.
-
-    Noise shifts the expected estimate (errors in variables), so a failing sensor would look like a faulty plant. A low
-    quantile over time tells it from a fault, whose residual is large only until the estimate has followed.
-    """
-    settled = estimates.power[estimates.updates > 3.0 * pipeline.memory]
-    growth = float(np.quantile(settled, 0.1)) if len(settled) else 1.0
-    return growth if growth > MIN_NOISE_GROWTH else 1.0
-
-
-def _has_failed_instrument(exam: Examination) -> bool:
-    """Return whether the instrument of the nominal loop tells nothing of this recording's motion, or the contrary.
-
-    The mean of theta moves by -E[z z']^-1 E[z phi'] theta/N: its eigenvalues tell where it goes. Coefficients that an
-    instrument has been learned for are not those of the AKF, which therefore cannot take over there.
-    """
-    if exam.baseline.recursion.instrument is not None or not exam.pipeline.bank.has_instrument:
-        return False
-    recording, runner, scale = exam.recording, RegressionRunner(exam.pipeline), exam.tuning.scale
-    own = shared = np.zeros((len(scale), len(scale)))
-    for rows in outofcore.iter_chunks(0, recording.samples):
-        part = recording.rows(rows)
-        g = runner.advance(part.r, part.u, part.y, part.restart)
-        z, phi = g.z[g.ok] / scale, g.phi[g.ok] / scale
-        own, shared = own + z.T @ z, shared + z.T @ phi
-    if not own.any():
-        return False
-    return bool(np.linalg.eigvals(np.linalg.lstsq(own, shared, rcond=None)[0]).real.min() < MIN_INSTRUMENT_EIGENVALUE)
