@@ -193,22 +193,21 @@ class Examination:
         """Whether there was an alarm of the coefficients that a motion never seen does not explain, shape (K,)."""
         if not self.apparent_alarm.any() or self.motion is None:  # in this order: the motion takes a second reading
             return self.apparent_alarm
-        exceeded, seen = np.zeros((2, self.evaluations), dtype=np.bool_)
+        exceeded, unseen, told = np.zeros((3, self.evaluations), dtype=np.bool_)
         e, limit = self.estimates, self.baseline.thresholds.statistic
         for at in outofcore.iter_chunks(0, self.evaluations, e.theta, e.S, at_once=AT_ONCE):
             C, excess = self.covariance(at), self.motion_excess(at)
             T2 = np.where(self.ready[at], t2_statistic(e.theta[at], self.expected[at], C + self.model_error(at)), 0.0)
             # the sequential test knows no model error
-            exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & (excess < UNSEEN_EXCESS))
-            seen[at] = excess < UNSEEN_EXCESS
+            unseen[at] = excess >= UNSEEN_EXCESS
+            exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & ~unseen[at])
             if self.baseline.axis is not None:  # its terms are those of physics, and hold as far as they are known
-                told = self.motion.tells(e.theta[at] - self.expected[at], C, at)
-                exceeded[at] |= told
-                seen[at] |= told
-        exceeded &= any_exceeded(self.statistics[:2])
+                told[at] = self.motion.tells(e.theta[at] - self.expected[at], C, at)
+        exceeded = (exceeded | told) & any_exceeded(self.statistics[:2])
         self.release()
-        vibrates = self.change is not None and self.change.vibration is not None
-        changed = self._changed & (vibrates or (self._changed & seen).any())
+        changed = self._changed
+        if self.change is not None and self.change.vibration is None:  # one that lasts is told most of the time
+            changed = changed & (2 * told[changed].sum() > changed.sum() or not unseen[changed].any())
         return changed | apply_alarm_delays(exceeded, *self.pipeline.delays)
 
     @property
