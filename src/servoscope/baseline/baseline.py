@@ -136,6 +136,11 @@ class Baseline(ShortRepr, LearnedEvidence):
         return parse_stored_loop(self.loop_settings)
 
     @property
+    def fault_names(self) -> tuple[str, ...]:
+        """Names of the faults that its plant knows."""
+        return tuple(fault.name for fault in self.loop.plant.all_faults)
+
+    @property
     def points(self) -> tuple[str, ...]:
         """Names of the operating points; none where none was declared."""
         return (self.point, *(other.point for other in self.others)) if self.point or self.others else ()
@@ -327,7 +332,9 @@ class Baseline(ShortRepr, LearnedEvidence):
                 f"{path}: is not a baseline (no JSON); give the file that servoscope learn wrote"
             ) from None
         if isinstance(content, Mapping) and content.get("format") == ARM_FORMAT:
-            raise BaselineError(f"{path}: baseline of an arm, which diagnose takes, and no other command")
+            raise BaselineError(
+                f"{path}: baseline of an arm, which diagnose, services and fleets take, and no other command"
+            )
         if not isinstance(content, Mapping) or content.get("format") != FORMAT:
             raise BaselineError(f"{path}: is not a baseline; give the file that servoscope learn wrote")
         version = content.get("version")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,13 +12,13 @@ from servoscope.baseline.arm import ArmBaseline
 from servoscope.core.messages import translate
 from servoscope.diagnosis.arm import ArmExamination
 from servoscope.diagnosis.result import Diagnosis
-from servoscope.models.arm.dynamics import joint_positions
-from servoscope.report.page import render_page, say, write_page
+from servoscope.report.diagnosis_document import LABELS, diagnosis_document
+from servoscope.report.document import DETAILS, EVIDENCE, PicturePart, Section, to_html
+from servoscope.report.format_values import format_clock_time
+from servoscope.report.page import ResultTable, say, write_page
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-LABELS = {"fault": "Fault", "healthy": "Healthy", "undetermined": "Undetermined"}
 
 
 def write_arm_page(path: str | Path, diagnosis: Diagnosis, examination: ArmExamination, baseline: ArmBaseline) -> None:
@@ -29,48 +30,45 @@ def render_arm_page(diagnosis: Diagnosis, examination: ArmExamination, baseline:
     """Return the page; it needs nothing from outside, no script and no network."""
     from servoscope.report.plotting import render_svg  # late: matplotlib takes half a second to import
 
-    odds = joint_odds(diagnosis, baseline.model.arm.names)
-    figures = [
-        ("The arm and its joints", say("arm.page_joints"), plot_arm(examination, baseline, odds)),
-        ("Torque from outside or unexplained", say("arm.page_torque"), plot_torque(examination, baseline, diagnosis)),
-    ]
-    return render_page(
-        "arm.html",
+    torque = plot_torque(examination, baseline, diagnosis)
+    drawn = {"arm": plot_arm(**examination.picture(baseline, diagnosis)), "torque": torque}
+    recordings = ", ".join(source.name for source in baseline.sources)
+    origin = ResultTable(
+        ("Quantity", "Value"), [(translate("baseline"), baseline.hash), (translate("recordings"), recordings)], words=2
+    )
+    return to_html(
+        (
+            *diagnosis_document(diagnosis),
+            Section("Torque from outside or unexplained", (PicturePart("torque"),), EVIDENCE, say("arm.page_torque")),
+            Section("Where this comes from", (origin,), DETAILS),
+        ),
+        {name: render_svg(figure, name) for name, figure in drawn.items()},
         title=f"{translate(LABELS[diagnosis.verdict])}: {diagnosis.recording}",
         kind=diagnosis.verdict,
         label=LABELS[diagnosis.verdict],
-        diagnosis=diagnosis,
-        name=baseline.loop.name,
-        figures=[(name, lead, render_svg(figure, f"a{i}")) for i, (name, lead, figure) in enumerate(figures)],
-        provenance={"baseline": baseline.hash, "recordings": ", ".join(source.name for source in baseline.sources)},
+        name=diagnosis.recording,
+        about=f"{translate('on')} {baseline.loop.name}",
+        size=[format_clock_time(diagnosis.duration_s)],
     )
 
 
-def joint_odds(diagnosis: Diagnosis, names: tuple[str, ...]) -> list[float]:
-    """Return the probability that each joint has changed."""
-    return [
-        sum(candidate.probability for candidate in diagnosis.candidates if candidate.name.endswith(f" of {name}"))
-        for name in names
-    ]
-
-
-def plot_arm(examination: ArmExamination, baseline: ArmBaseline, odds: list[float]) -> Figure:
-    """Draw the arm as in the middle of the recording, its joints filled by their probability of a change."""
+def plot_arm(
+    names: Sequence[str], parents: Sequence[int], places: Sequence[Sequence[float]], odds: Sequence[float]
+) -> Figure:
+    """Draw the arm with its joints at these places [m], filled by their probability of a change."""
     from matplotlib.figure import Figure as NewFigure
 
     from servoscope.report.plotting import COLOURS, plot_style
 
-    arm, q = baseline.model.arm, examination.signals.q
-    places = joint_positions(arm, q[len(q) // 2])
     with plot_style():
         figure = NewFigure(figsize=(7.0, 3.2), layout="constrained")
         axes: Any = figure.add_subplot(projection="3d")
         for j, place in enumerate(places):
-            start = places[arm.parents[j]] if arm.parents[j] >= 0 else np.zeros(3)
+            start = places[parents[j]] if parents[j] >= 0 else (0.0, 0.0, 0.0)
             axes.plot(*np.column_stack([start, place]), color=COLOURS["muted"], linewidth=3.0)
             fill = COLOURS["alarm"] if odds[j] >= 0.5 else COLOURS["care"] if odds[j] >= 0.05 else COLOURS["healthy"]
-            axes.plot(*place[:, None], "o", color=fill, markersize=7.0)
-            axes.text(*place, f"  {arm.names[j]}", fontsize=7.5)
+            axes.plot(*np.array(place)[:, None], "o", color=fill, markersize=7.0)
+            axes.text(*place, f"  {names[j]}", fontsize=7.5)
         axes.set_axis_off()
         axes.set_aspect("equal")
     return figure
