@@ -136,6 +136,11 @@ class Baseline(ShortRepr, LearnedEvidence):
         return parse_stored_loop(self.loop_settings)
 
     @property
+    def logged_covariates(self) -> tuple[str, ...]:
+        """Names of the channels that a recording must have beside r, u and y; a warm-up that nobody logs is none."""
+        return () if self.covariates is None or self.covariates.warm_up is not None else self.covariates.names
+
+    @property
     def fault_names(self) -> tuple[str, ...]:
         """Names of the faults that its plant knows."""
         return tuple(fault.name for fault in self.loop.plant.all_faults)
@@ -333,7 +338,7 @@ class Baseline(ShortRepr, LearnedEvidence):
             ) from None
         if isinstance(content, Mapping) and content.get("format") == ARM_FORMAT:
             raise BaselineError(
-                f"{path}: baseline of an arm, which diagnose, services and fleets take, and no other command"
+                f"{path}: baseline of an arm, whose torques depend on all joints: diagnose, services and fleets take it"
             )
         if not isinstance(content, Mapping) or content.get("format") != FORMAT:
             raise BaselineError(f"{path}: is not a baseline; give the file that servoscope learn wrote")

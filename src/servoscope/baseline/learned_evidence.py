@@ -22,8 +22,3 @@ class LearnedEvidence(BaselineMemory):
     axis: AxisModel | None = None
     covariates: CovariateModel | None = None
     residual: ResidualModel | None = Field(default=None, exclude_if=lambda value: value is None)
-
-    @property
-    def logged_covariates(self) -> tuple[str, ...]:
-        """Names of the channels that a recording must have beside r, u and y; a warm-up that nobody logs is none."""
-        return () if self.covariates is None or self.covariates.warm_up is not None else self.covariates.names

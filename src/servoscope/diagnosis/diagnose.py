@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -163,7 +163,8 @@ def _judge_signals(
         raise RecordingError(f"{recording.name}: {missing}")
     exams = [Examination.from_recording(one, recording) for one in points]
     if (unusable := next(findings(exams[0], "undetermined"), None)) is not None:
-        return leave_undetermined(exams[0], unusable.text), exams[0], None
+        change = _feature_change(exams[0]) if unusable.kind == "outside" else {}
+        return leave_undetermined(exams[0], unusable.text).model_copy(update=change), exams[0], None
     if (own := next(filter(None, map(examine_by_own_past, exams)), None)) is not None and own.alarm.any():
         diagnosis, correction = diagnose_examination(own, progress)
         return _with_warnings(diagnosis, [own_past_warning(own), *sensors]), own, correction
@@ -225,18 +226,14 @@ def diagnose_examination(
     verdict: Verdict = "fault"
     intervals: tuple[FaultInterval, ...] = ()
     onset: Onset | None = None
-    changed = next(findings(exam, "change"), None)
     if alarm is not None:
         at = alarm.evaluation
         intervals, onset, doubts = _explain_alarm(exam, alarm, progress)
         verdict = "healthy" if is_repaired(exam, intervals) else verdict
         warnings = _all_warnings(exam, doubts)
         headline = build_headline(verdict, intervals, {}, warnings, baseline.point)
-    elif changed is not None:
-        unknown = (Candidate(name=UNKNOWN, probability=1.0),)
-        warnings = _all_warnings(exam, [])
-        intervals = (FaultInterval(detected_at_s=changed.from_s, probability=1.0, candidates=unknown),)
-        headline = changed.text
+    elif change := _feature_change(exam):
+        headline, intervals, warnings = change["headline"], change["intervals"], _all_warnings(exam, [])
     else:
         verdict, headline, warnings = judge_without_alarm(exam)
     interval = next((one for one in intervals if _covers(one, float(exam.t(at)))), intervals[-1] if intervals else None)
@@ -244,8 +241,8 @@ def diagnose_examination(
     end = corrected_trace(exam, correction, slice(max(last, 0), last + 1))
     explained = end if at == last else corrected_trace(exam, correction, slice(at, at + 1))
     reasons = build_reasons(exam, explained, interval) if alarm is not None and interval is not None else ()
-    if features is not None and features.changed is not None:
-        reasons = (*reasons, *features.reasons(features.changed, alone=alarm is None))
+    if features is not None and (changed := features.changed) is not None:
+        reasons = (*reasons, *features.reasons(changed, alone=alarm is None))
     diagnosis = Diagnosis(
         **recording_facts(recording),
         verdict=verdict,
@@ -259,6 +256,21 @@ def diagnose_examination(
         point=baseline.point or None,
     )
     return diagnosis, correction
+
+
+def _feature_change(exam: Examination) -> dict[str, Any]:
+    """Return what a diagnosis says of features that changed; their limits widen beyond the learned covariates."""
+    features, change = exam.features, next(findings(exam, "change"), None)
+    if features is None or features.changed is None or change is None:
+        return {}
+    unknown = (Candidate(name=UNKNOWN, probability=1.0),)
+    interval = FaultInterval(detected_at_s=change.from_s, probability=1.0, candidates=unknown)
+    return {
+        "verdict": "fault",
+        "headline": change.text,
+        "reasons": features.reasons(features.changed, alone=True),
+        "intervals": (interval,),
+    }
 
 
 def judge_without_alarm(exam: Examination) -> tuple[Verdict, Message, list[DiagnosisWarning]]:

@@ -177,9 +177,11 @@ def _judge(exam: Examination) -> Iterator[Finding]:
     if exam.along is None:
         return
     rate, hold_s = exam.recording.sample_rate, exam.baseline.loop.monitor.covariate_hold_s
-    reason = exam.along.outside or exam.along.model.describe_stale(exam.recording.channels, hold_s, rate)
-    if reason is not None:
-        yield Finding.throughout(exam, "undetermined", "signals", reason)
+    stale = exam.along.model.describe_stale(exam.recording.channels, hold_s, rate)
+    if (outside := exam.along.outside) is not None:
+        yield Finding.throughout(exam, "undetermined", "outside", outside)
+    elif stale is not None:
+        yield Finding.throughout(exam, "undetermined", "signals", stale)
     elif exam.alarm.any():
         yield from _doubt_values(exam, exam.along)
 

@@ -59,7 +59,7 @@ class Examination:
     statistic: FloatArray  # T^2, shape (K,)
     skipped_share: float  # share of the updates that the estimator's guard skipped
     noise_growth: float  # of the noise's variance against the baseline's
-    change: AxisChange | None = None  # within the recording, where it is one of a motor axis
+    apparent_change: AxisChange | None = None  # within the recording, where it is one of a motor axis
     along: CovariatePath | None = None  # what covariates make of the coefficients; None where none were learned
     replaced: bool = False  # whether the instrument of the nominal loop failed and the AKF took over
     quick: bool = False  # whether features are left out: of assets that are monitored, the monitor follows them
@@ -70,7 +70,6 @@ class Examination:
 
         `quick`: whether features and residual are left out, and the sequential test may be held against the baseline's
         own limits where neither these nor those for the recording's reference, which take far longer, raise an alarm.
-
         Raises RecordingError if the recording's sample rate is not the loop's.
         """
         loop = baseline.loop
@@ -81,8 +80,7 @@ class Examination:
             )
         along, pipeline = None, baseline.pipeline()
         if (model := baseline.covariates) is not None:
-            memory = pipeline.memory_samples
-            theta = np.array(baseline.theta)
+            memory, theta = pipeline.memory_samples, np.array(baseline.theta)
             if model.warm_up is None:
                 along = CovariatePath.of(model, theta, recording.channels, memory)
             else:
@@ -96,8 +94,7 @@ class Examination:
             baseline = baseline.model_copy(update=followed)
         exam = _run_quickly(baseline, recording) if quick and along is None else None
         exam = exam or _run_recursion(baseline, recording, pipeline, along)
-        skipped = exam.estimates.skipped_share
-        own = baseline.recursion.instrument is not None
+        skipped, own = exam.estimates.skipped_share, baseline.recursion.instrument is not None
         replaced = not own and has_failed_instrument(exam.pipeline, exam.tuning, recording)
         if replaced or skipped > MAX_SKIPPED_SHARE:
             other = loop.model_copy(update={"monitor": loop.monitor.model_copy(update=FALL_BACK)})
@@ -111,7 +108,7 @@ class Examination:
             from servoscope.isolation.ml.axis_scan import find_axis_change
 
             change = find_axis_change(baseline, recording)
-        return replace(exam, skipped_share=skipped, replaced=replaced, change=change, quick=quick)
+        return replace(exam, skipped_share=skipped, replaced=replaced, apparent_change=change, quick=quick)
 
     @cached_property
     def drifts(self) -> bool:
@@ -176,12 +173,30 @@ class Examination:
     @cached_property
     def apparent_alarm(self) -> npt.NDArray[np.bool_]:
         """Whether a statistic of the coefficients was above its limit, after the delays, shape (K,)."""
-        return self._changed | apply_alarm_delays(any_exceeded(self.statistics[:2]), *self.pipeline.delays)
+        changed = self._changed(self.apparent_change)
+        return changed | apply_alarm_delays(any_exceeded(self.statistics[:2]), *self.pipeline.delays)
 
-    @property
-    def _changed(self) -> npt.NDArray[np.bool_]:
-        """Whether a change within the recording had been detected, or was not yet repaired, shape (K,)."""
-        change, index = self.change, self.estimates.index
+    @cached_property
+    def change(self) -> AxisChange | None:
+        """The change within the recording; None where a motion never seen may explain it: its limit knows none."""
+        if (change := self.apparent_change) is None:
+            return None
+        at = min(int(np.searchsorted(self.estimates.index, change.detected)), self.evaluations - 1)
+        unseen, told = self.motion_excess(slice(at, at + 1)) >= UNSEEN_EXCESS, self._told[self._changed(change)]
+        return None if unseen.any() and 2 * told.sum() <= len(told) else change  # one that lasts is told mostly
+
+    @cached_property
+    def _told(self) -> npt.NDArray[np.bool_]:
+        """Where an axis, whose terms are those of physics, is off by more than its extrapolation is, shape (K,)."""
+        told, e = np.zeros(self.evaluations, dtype=np.bool_), self.estimates
+        if self.motion is not None and self.baseline.axis is not None:
+            for at in outofcore.iter_chunks(0, self.evaluations, e.theta, e.S, at_once=AT_ONCE):
+                told[at] = self.motion.tells(e.theta[at] - self.expected[at], self.covariance(at), at)
+        return told
+
+    def _changed(self, change: AxisChange | None) -> npt.NDArray[np.bool_]:
+        """Return whether a change within the recording had been detected, or was not yet repaired, shape (K,)."""
+        index = self.estimates.index
         if change is None:  # what is left of u speaks of the whole recording
             return np.asarray((index == index[-1:].sum()) & (self.residual_ratios > 1.0).any())
         if change.repaired:
@@ -193,22 +208,16 @@ class Examination:
         """Whether there was an alarm of the coefficients that a motion never seen does not explain, shape (K,)."""
         if not self.apparent_alarm.any() or self.motion is None:  # in this order: the motion takes a second reading
             return self.apparent_alarm
-        exceeded, unseen, told = np.zeros((3, self.evaluations), dtype=np.bool_)
+        exceeded = np.zeros(self.evaluations, dtype=np.bool_)
         e, limit = self.estimates, self.baseline.thresholds.statistic
         for at in outofcore.iter_chunks(0, self.evaluations, e.theta, e.S, at_once=AT_ONCE):
-            C, excess = self.covariance(at), self.motion_excess(at)
-            T2 = np.where(self.ready[at], t2_statistic(e.theta[at], self.expected[at], C + self.model_error(at)), 0.0)
+            C = self.covariance(at) + self.model_error(at)
+            T2 = np.where(self.ready[at], t2_statistic(e.theta[at], self.expected[at], C), 0.0)
             # the sequential test knows no model error
-            unseen[at] = excess >= UNSEEN_EXCESS
-            exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & ~unseen[at])
-            if self.baseline.axis is not None:  # its terms are those of physics, and hold as far as they are known
-                told[at] = self.motion.tells(e.theta[at] - self.expected[at], C, at)
-        exceeded = (exceeded | told) & any_exceeded(self.statistics[:2])
+            exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & (self.motion_excess(at) < UNSEEN_EXCESS))
+        exceeded = (exceeded | self._told) & any_exceeded(self.statistics[:2])
         self.release()
-        changed = self._changed
-        if self.change is not None and self.change.vibration is None:  # one that lasts is told most of the time
-            changed = changed & (2 * told[changed].sum() > changed.sum() or not unseen[changed].any())
-        return changed | apply_alarm_delays(exceeded, *self.pipeline.delays)
+        return self._changed(self.change) | apply_alarm_delays(exceeded, *self.pipeline.delays)
 
     @property
     def explained(self) -> int:
@@ -311,8 +320,7 @@ def _settling(pipeline: Pipeline, plant: Plant) -> int:
 
 def _reference_piece(recording: Recording, rows: slice, first: int) -> ReferencePath:
     """Return the reference of a chunk; the run began at sample `first`."""
-    before = rows.start - 1
-    ahead = (float(recording.t[before]), float(recording.r[before])) if rows.start > first else None
+    ahead = (float(recording.t[rows.start - 1]), float(recording.r[rows.start - 1])) if rows.start > first else None
     return reference_path(recording.rows(rows), ahead)
 
 
@@ -336,9 +344,8 @@ def _run_recursion(
 
     `run`: with the baseline's own sequential test; None: with limits for the recording's reference.
     """
-    tuning, noise, walk, watch = baseline.tuning, None, None, None
-    if baseline.healthy.noise is not None:
-        noise = baseline.healthy.noise.times(np.sqrt(growth))
+    tuning, noise, walk, watch = baseline.tuning, baseline.healthy.noise, None, None
+    noise = None if noise is None else noise.times(np.sqrt(growth))
     if run is not None:
         walk = None if run.mean is None else run.mean.again()
     elif noise is None:
@@ -352,9 +359,8 @@ def _run_recursion(
     def healthy(rows: slice) -> FloatArray:
         if walk is None:
             return tuning.theta
-        return np.asarray(
-            walk.advance(_reference_piece(recording, rows, 0)) + (tuning.theta - np.array(baseline.healthy.theta))
-        )
+        piece = _reference_piece(recording, rows, 0)
+        return np.asarray(walk.advance(piece) + (tuning.theta - np.array(baseline.healthy.theta)))
 
     started = tuning if along is None else replace(tuning, theta=along.start)
     estimating = EstimationRunner(pipeline, started, watch) if run is None else run.estimates.again()
@@ -380,7 +386,6 @@ def _run_recursion(
             outofcore.release(*recording.columns)
         if kept is not None:
             kept.result()
-    found = {name: column.to_array() for name, column in columns.items()}
-    expected, T2 = found.pop("expected"), found.pop("statistic")
-    estimates = Estimates(**found)
-    return Examination(baseline, recording, pipeline, tuning, estimates, noise, expected, T2, 0.0, growth)
+    arrays = {name: column.to_array() for name, column in columns.items()}
+    expected, T2 = arrays.pop("expected"), arrays.pop("statistic")
+    return Examination(baseline, recording, pipeline, tuning, Estimates(**arrays), noise, expected, T2, 0.0, growth)

@@ -115,10 +115,11 @@ def examine_blocks(
         exam = Examination.from_recording(baseline, recording, quick=True)
     except ServoscopeError as error:
         return undetermined("unusable", error=str(error))
-    if (reason := next(findings(exam, "undetermined"), None)) is not None:
-        return undetermined("unusable", error=reason.text)
-    if not exam.alarm.any():
-        if features is not None and features > 1.0:
+    unusable, changed = next(findings(exam, "undetermined"), None), features is not None and features > 1.0
+    if unusable is not None and not changed:
+        return undetermined("unusable", error=unusable.text)
+    if unusable is not None or not exam.alarm.any():
+        if changed:
             headline = message("service.examination.features", excess=features)
             return StoredDiagnosis(verdict="fault", headline=headline, onset=None)
         if known is not None:
