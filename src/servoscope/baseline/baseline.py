@@ -65,10 +65,11 @@ class Baseline(ShortRepr, LearnedEvidence):
         Warnings of `learn`; faults known from labelled recordings.
     exact
         What the exact predictor says of the healthy recordings; None where there is none.
-    sensors, features, motion, axis, covariates, residual
+    sensors, features, motion, axis, covariates, residual, pressures
         Further evidence, None where there is none: how the sensors of the output disagree; what four or more recordings
         show besides coefficients; the motion that they hold; the healthy motor axis that its refit starts from; how
-        coefficients move with covariates, theta being theirs in the middle of the learned range; what these leave of u.
+        coefficients move with covariates, theta being theirs in the middle of the learned range; what these leave of u;
+        what logged pressures of a cylinder show.
     point, others
         Name of the operating point, empty where none was declared; the baselines of the other points. A baseline with
         others is itself that of the first point.

@@ -8,6 +8,7 @@ from servoscope.baseline.axis_model import AxisModel
 from servoscope.baseline.covariates import CovariateModel
 from servoscope.baseline.feature_model import FeatureModel
 from servoscope.baseline.motion import MotionRange
+from servoscope.baseline.pressure_model import PressureModel
 from servoscope.baseline.records import BaselineMemory
 from servoscope.baseline.residual_model import ResidualModel
 from servoscope.baseline.sensors import SensorModel
@@ -22,3 +23,4 @@ class LearnedEvidence(BaselineMemory):
     axis: AxisModel | None = None
     covariates: CovariateModel | None = None
     residual: ResidualModel | None = Field(default=None, exclude_if=lambda value: value is None)
+    pressures: PressureModel | None = Field(default=None, exclude_if=lambda value: value is None)

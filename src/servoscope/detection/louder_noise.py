@@ -17,6 +17,7 @@ WHITE_RATIO = 252.0 / 70.0  # of white noise: variance of the differences of ord
 MIN_WHITE_SHARE = 0.8  # of that ratio, which a motion or a vibration does not have
 MIN_GROWTH = 2.0  # of the variance: less moves no estimate by as much as it scatters
 MIN_LOG_LIKELIHOOD_GAIN = 100.0  # of two variances against one; differences of white noise hang together for four
+MIN_NOISE_GROWTH = 1.5  # of the variance of the residual; below it counts as none
 MIN_OWN_GROWTH = 1.5  # of that of the whole signal: one that is scaled is another unit or gain
 MAX_SAMPLES = 2_000_000  # of a recording, which is looked at as a whole
 MIN_NOISE_GROWTH = 1.5  # of the variance of the residual; below it counts as none

@@ -21,12 +21,14 @@ from servoscope.evidence.features import MIN_RECORDINGS, are_expected
 from servoscope.evidence.kind import HealthyRecordings
 from servoscope.evidence.kinds import learn_evidence
 from servoscope.evidence.population import Population
+from servoscope.evidence.residual import MIN_RECORDINGS as MIN_RECORDINGS_OF_RESIDUAL
 from servoscope.evidence.signals import find_switched_off
 from servoscope.isolation.ml.validity import fit_exact_predictor
 from servoscope.learning.axis_fit import fit_axis
 from servoscope.learning.delay import check_delay
 from servoscope.learning.detectability import learn_detectability
 from servoscope.learning.healthy_plant import PlantKnowledge, learn_plant, learn_sequential_test
+from servoscope.learning.pressures import learn_pressures
 from servoscope.learning.recursion import (
     check_signals,
     describe_recursion,
@@ -183,7 +185,23 @@ def _assemble_baseline(
     progress("predictor")
     draft = _with_exact_predictor(baseline, recordings)
     progress("features")
-    return _carry_features(learn_evidence(healthy, draft), before)
+    return _with_pressures(_carry_features(learn_evidence(healthy, draft), before), healthy)
+
+
+def _with_pressures(baseline: Baseline, healthy: HealthyRecordings) -> Baseline:
+    """Learn the pressures where they are logged; a change that they show is promised, however small for the others."""
+    model = learn_pressures(healthy)
+    if model is None and healthy.loop.plant.channels:
+        note = message("learning.no_pressures", needed=MIN_RECORDINGS_OF_RESIDUAL)
+        return baseline.model_copy(update={"notes": (*baseline.notes, note)})
+    if model is None:
+        return baseline
+    own, promised = model.detectable_changes, []
+    for change in baseline.detectability.changes:
+        smallest = min(change.change or np.inf, own.get(change.parameter, np.inf))
+        promised.append(change.model_copy(update={"change": smallest if np.isfinite(smallest) else None}))
+    detectability = baseline.detectability.model_copy(update={"changes": tuple(promised)})
+    return baseline.model_copy(update={"pressures": model, "detectability": detectability})
 
 
 def _carry_features(baseline: Baseline, before: Baseline | None) -> Baseline:
