@@ -148,14 +148,18 @@ def _learn_scatter(
         np.concatenate([X, deviation_columns(model, signal, X, fit.theta)], axis=1)
         for signal, X in zip(signals, designs, strict=True)
     ]
-    inflation = _inflation(signals, columns, residuals, fit.noise, len(fit.theta))
-    weight = fit.noise * np.sqrt(inflation)
-    whole = [
-        block_information(signal.t, *weighted(signal, X, e, weight))
-        for signal, X, e in zip(signals, columns, residuals, strict=True)
-    ]
-    moves = slice(len(fit.theta), None)
-    between = random_effect([_change(one, moves) for one in whole], scale, BETWEEN_SHARE)
+    moves, left = slice(len(fit.theta), None), residuals
+    for _ in range(2):  # by how recordings differ as a whole, they do not differ from block to block
+        inflation = _inflation(signals, columns, left, fit.noise, len(fit.theta))
+        weight = fit.noise * np.sqrt(inflation)
+        whole = [
+            block_information(signal.t, *weighted(signal, X, e, weight))
+            for signal, X, e in zip(signals, columns, residuals, strict=True)
+        ]
+        changes = [_change(one, moves) for one in whole]
+        between = random_effect(changes, scale, BETWEEN_SHARE)
+        own = [np.linalg.solve(A + np.diag(between**-2.0), g) for A, g in changes]
+        left = [e - np.einsum("jdm,d->jm", X[:, moves], d) for X, e, d in zip(columns, residuals, own, strict=True)]
     halves = [second_half(one.part(moves), np.diag(between**-2.0)) for one in whole]
     return _Scatter(inflation, whole, scale, between, random_effect(halves, scale, DRIFT_SHARE))
 
