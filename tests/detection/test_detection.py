@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import signal, stats
 
+import servoscope as ss
 from servoscope.baseline.threshold import SECONDS_PER_YEAR, threshold
 from servoscope.detection.onset import estimate_onset
 from servoscope.detection.statistic import noncentrality, required_noncentrality, t2_statistic, whiten
@@ -168,13 +169,12 @@ class TestOnset:
         cut[200] = True  # a gap: its samples do not count
         recording = replace(recording, restart=cut)
         g = pipeline.regression(recording.r, recording.u, recording.y, cut)
-        used = np.flatnonzero(g.ok[: last + 1])
-        v, changed = (g.eta - g.phi @ healthy)[used], (g.phi @ (faulty - healthy))[used]
+        ok = g.ok[: last + 1]
+        v, changed = (ok * x[: last + 1] for x in (g.eta - g.phi @ healthy, g.phi @ (faulty - healthy)))
         step = np.zeros((pipeline.bank.wait + 1, 3))
         step[1:, 1] = 1.0
         ramp = pipeline.bank.system.simulate(step)[1:, 0]
-        of_used = naive.change_point(v, changed, ramp / ramp[-1], len(ramp))
-        log_likelihood = np.array([of_used[min(np.searchsorted(used, k), len(used) - 1)] for k in range(until + 1)])
+        log_likelihood = naive.change_point(v, changed, ramp / ramp[-1], len(ramp), ok)[: until + 1]
         weight = np.exp(log_likelihood - log_likelihood.max())
         share = np.cumsum(weight) / weight.sum()
         found = estimate_onset(pipeline, recording, healthy, faulty, until, last)
@@ -188,3 +188,16 @@ class TestOnset:
         found = estimate_onset(*arguments)
         assert 0.0 <= found.low_s <= found.likely_s <= found.high_s <= arguments[4] / 100.0
         assert found.low_s == 0.0
+
+
+def test_a_polynomial_dates_a_change_at_rest_by_all_of_the_rest(rig: dict[str, Any]) -> None:
+    """Rows at rest do not count; a leak that comes with the next motion may have come with any of them."""
+    base = Loop.from_dict(rig)
+    plant = {"kind": "polynomial", "order": 3, "stiffness": True, "offset": True}
+    loop = Loop.from_dict({"sample_rate": 100.0, "plant": plant, "monitor": {"cutoff": 10.0, "memory": 5.0}})
+    r = reference("profile", 60.0, 100.0)
+    baseline = ss.learn(loop, [simulate(base, r, seed=1)[0]])
+    found = ss.diagnose(baseline, simulate(base, r, faults=[FaultEvent.parse("C_ie=1.2@30")], seed=2)[0])
+    assert found.intervals[0].onset_s is not None
+    low, likely, high = found.intervals[0].onset_s
+    assert 25.0 < low < 26.0 and low <= likely <= high and 29.9 < high < 30.5

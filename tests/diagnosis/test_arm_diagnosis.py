@@ -65,7 +65,7 @@ def test_a_simulated_arm(simulated: tuple[ArmBaseline, Read], tmp_path: Path) ->
     assert diagnose_arm(baseline, record(20, None)).verdict == "healthy"
     diagnosis, examination = examine_arm(baseline, record(21, ArmChange("friction", 1.5, 3, 15.0)))
     (fault,) = diagnosis.faults
-    assert (fault.name, fault.parameter) == ("friction", "elbow.coulomb_friction")
+    assert (fault.name, fault.parameter) == ("friction of elbow", "elbow.coulomb_friction")
     assert fault.ratio == pytest.approx(1.5, abs=0.15)
     assert diagnosis.onset_s is not None and diagnosis.onset_s[1] == pytest.approx(15.0, abs=0.5)
     page = render_arm_page(diagnosis, examination, baseline)
@@ -169,7 +169,7 @@ def test_friction_is_found_in_its_joint(ur10e: tuple[ArmBaseline, Callable[[str]
             coulomb = baseline.coefficient(f"{name}.coulomb_friction")[0]
             torque[:, j] += growth * coulomb * np.tanh(v[:, j] / 0.01) * late
             for fault in diagnose_arm(baseline, replace(recording, torque=torque)).faults:
-                assert fault.parameter.startswith(f"{name}.") and fault.name == "friction"
+                assert fault.parameter.startswith(f"{name}.") and fault.name == f"friction of {name}"
                 found[growth] += fault.interval[0] < 1.0 + growth < fault.interval[1]
     assert found[0.3] == 6 and found[0.1] >= 4
 

@@ -383,7 +383,7 @@ def test_a_mapping_that_cannot_work_is_refused_in_one_line(tmp_path: Path) -> No
         ('topics = ["{asset}"]\ntimes = "t"', "did you mean 'time'?"),
         ('topics = ["{asset}"]\nvalue = "v"', "say by {signal} in topics, rows or match of which signal it is"),
         ('topics = ["{asset}/{signal}", "{asset}"]', "{signal} must stand in all of them, or in none"),
-        ('topics = ["{asset}"]\nfields = { r = "y" }', "r, u, y and covariates must all be different ones"),
+        ('topics = ["{asset}"]\nfields = { r = "y" }', "r, u and y must be different ones, and so must covariates"),
         ('topics = ["{asset}"]\ncalled = { pres = "Device" }', "there is no asset 'pres' of this source"),
         ('form = "telegraf"', "topics: missing"),
     ):

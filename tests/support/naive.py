@@ -281,9 +281,10 @@ def t_squared(theta: Array, expected: Array, covariance: Array) -> Array:
     return np.array([(t - m) @ np.linalg.inv(C) @ (t - m) for t, m, C in zip(theta, expected, covariance, strict=True)])
 
 
-def change_point(v: Array, changed: Array, ramp: Array, lags: int) -> Array:
+def change_point(v: Array, changed: Array, ramp: Array, lags: int, ok: npt.NDArray[np.bool_]) -> Array:
     """Return the log-likelihood of a change at every update i: v - size ramp(k - i) changed is noise, size at its best.
 
+    Samples that are not `ok` are zero, and no noise.
     Divided by the long-run variance over the variance of the scores under the best change.
     """
     N = len(v)
@@ -293,8 +294,8 @@ def change_point(v: Array, changed: Array, ramp: Array, lags: int) -> Array:
         size = max(float(np.linalg.lstsq(column[:, None], v, rcond=None)[0][0]), 0.0) if column.any() else 0.0
         left.append(v - size * column)
         found.append(-sum(left[-1] ** 2))
-    e = left[int(np.argmax(found))]
-    d = e * changed - np.mean(e * changed)
+    e, changed = left[int(np.argmax(found))][ok], changed[ok]
+    d, N = e * changed - np.mean(e * changed), len(e)
     gamma = [sum(d[lag:] * d[: N - lag]) / N for lag in range(lags + 1)]
     longer = 1.0 + 2.0 * sum((1.0 - lag / (lags + 1.0)) * gamma[lag] / gamma[0] for lag in range(1, lags + 1))
     return np.array(found) / (2.0 * np.mean(e**2) * max(1.0, longer))

@@ -7,12 +7,12 @@ import json
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from pydantic import Field, ValidationError
 
-from servoscope.baseline.baseline import ARM_FORMAT
+from servoscope.baseline.baseline import ARM_FORMAT, Baseline
 from servoscope.baseline.records import BaselineModel, BaselineSource, Matrix, Vector
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, LoopError
@@ -159,6 +159,16 @@ class ArmBaseline(BaselineModel):
         """The changes that are told apart."""
         return arm_causes(self.model)
 
+    @property
+    def logged_covariates(self) -> tuple[str, ...]:
+        """Names of the signals that blocks of samples must have."""
+        return tuple(self.loop.channels)
+
+    @property
+    def fault_names(self) -> tuple[str, ...]:
+        """Names of the faults that may be found."""
+        return tuple(dict.fromkeys(cause.name for cause in self.causes if cause.kind != UNKNOWN))
+
     def save(self, path: str | Path) -> None:
         """Write the baseline as JSON; nothing half-written stays behind."""
         content = {"format": ARM_FORMAT, "version": VERSION, **self.model_dump(mode="json", by_alias=True)}
@@ -190,6 +200,14 @@ class ArmBaseline(BaselineModel):
         except (ValidationError, LoopError) as error:
             raise BaselineError(f"{path}: damaged baseline, {str(error).splitlines()[0]}; learn it again") from None
         return baseline
+
+
+AnyBaseline: TypeAlias = Baseline | ArmBaseline
+
+
+def load_baseline(path: str | Path) -> AnyBaseline:
+    """Read a baseline, of a loop or of an arm; raises BaselineError if it cannot be used."""
+    return ArmBaseline.load(path) or Baseline.load(path)
 
 
 def loosen(information: FloatArray, names: Sequence[str], theta: FloatArray) -> FloatArray:

@@ -152,6 +152,11 @@ class Baseline(ShortRepr, BaselineMemory):
         return () if self.covariates is None or self.covariates.warm_up is not None else self.covariates.names
 
     @property
+    def fault_names(self) -> tuple[str, ...]:
+        """Names of the faults that its plant knows."""
+        return tuple(fault.name for fault in self.loop.plant.all_faults)
+
+    @property
     def points(self) -> tuple[str, ...]:
         """Names of the operating points; none where none was declared."""
         return (self.point, *(other.point for other in self.others)) if self.point or self.others else ()
@@ -343,7 +348,9 @@ class Baseline(ShortRepr, BaselineMemory):
                 f"{path}: is not a baseline (no JSON); give the file that servoscope learn wrote"
             ) from None
         if isinstance(content, Mapping) and content.get("format") == ARM_FORMAT:
-            raise BaselineError(f"{path}: baseline of an arm, which diagnose takes, and no other command")
+            raise BaselineError(
+                f"{path}: baseline of an arm, which diagnose, services and fleets take, and no other command"
+            )
         if not isinstance(content, Mapping) or content.get("format") != FORMAT:
             raise BaselineError(f"{path}: is not a baseline; give the file that servoscope learn wrote")
         version = content.get("version")

@@ -18,8 +18,8 @@ from servoscope.design.fisher_information import (
     misnaming_probability,
 )
 from servoscope.design.scenario import Scenario
-from servoscope.fit.search import Experiment, fit
-from servoscope.isolation.ml.hypothesis import log_ratio_bounds
+from servoscope.fit.search import fit
+from servoscope.isolation.ml.hypothesis import change_experiment, log_ratio_bounds
 from servoscope.isolation.ml.least_squares import solve_least_squares
 from servoscope.isolation.ml.window import RefitWindow
 from servoscope.models.plants import Fault
@@ -176,19 +176,11 @@ def minimise_distance(
     search where a linear step leaves more than `MAX_SQUARED_DISTANCE`. Returns the closest point and what differs
     there, (N + m,).
     """
-    m, names = window.nuisance_count, tuple(fault.parameter for fault in faults)
+    experiment, m = change_experiment(window, faults, scene.profile, own), window.nuisance_count
     if not held:
-        left = window.residual(z, names, scene.profile) - own
-        J = window.jacobian(z, names, scene.profile)
-        step, distance = solve_least_squares(J, left)
+        at = experiment.at(z)
+        step, distance = solve_least_squares(at.jacobian, at.residual)
         if distance > MAX_SQUARED_DISTANCE:
-            return z, left + J @ step
-    anywhere, (low, high) = np.full(m, np.inf), log_ratio_bounds(faults)
-    experiment = Experiment(
-        lambda z: window.residual(z, names, scene.profile) - own,
-        np.full(len(z), np.inf),  # the prior is among the residuals
-        low=np.append(-anywhere, low),
-        high=np.append(anywhere, high),
-    )
+            return z, at.residual + at.jacobian @ step
     closest = fit(experiment, z, np.arange(m if held else 0, len(z)), STEPS, CONVERGED)
     return closest.x, closest.residual

@@ -66,18 +66,19 @@ def _log_likelihood(
     # u itself changes at once, where u_a of stage 1 has to learn the change first
     single = replace(pipeline, stage_one=None)
     g = single.regression(recording.r, recording.u, recording.y, recording.restart)
-    used = np.flatnonzero(g.ok)
-    phi, ramp = g.phi[used], _onset_of_filters(pipeline)
-    v, changed = g.eta[used] - phi @ healthy, phi @ (faulty - healthy)
+    # rows that are left out say nothing, but the filters go on: by their end they have let all of a change through
+    rows = slice(pipeline.stride - 1, None, pipeline.stride)
+    phi, ok, ramp = g.phi[rows], g.ok[rows], _onset_of_filters(pipeline)
+    v, changed = np.where(ok, g.eta[rows] - phi @ healthy, 0.0), np.where(ok, phi @ (faulty - healthy), 0.0)
     score = _sums_after(v * changed, ramp)
     information = np.maximum(_sums_after(changed**2, ramp**2), np.finfo(np.float64).tiny)
     size = np.maximum(score, 0.0) / information
     # a change between two updates shows at the later one
-    at_update = np.minimum(np.searchsorted(used, np.arange(until + 1)), len(used) - 1)
+    at_update = np.minimum(np.arange(until + 1) // pipeline.stride, len(v) - 1)
     gained = size * score
     best = at_update[int(np.argmax(gained[at_update]))]
     e = v - size[best] * changed * np.concatenate([np.zeros(best), ramp, np.ones(len(v))])[: len(v)]
-    variance = float(e @ e) / len(e) * long_run_inflation(e * changed, len(ramp))
+    variance = float(e @ e) / max(int(ok.sum()), 1) * long_run_inflation((e * changed)[ok], len(ramp))
     return np.asarray(gained[at_update] / (2.0 * variance))
 
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from servoscope.baseline.arm import SERVICE_ODDS, UNKNOWN, ArmBaseline, ArmCause
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.blas import with_one_blas_thread
+from servoscope.core.errors import RecordingError
 from servoscope.core.messages import Message, message
 from servoscope.detection.arm_events import ArmEvent, find_events, outside_events, outside_torque
 from servoscope.detection.arm_evidence import INTERVAL, MIN_END_BLOCKS, CauseEvidence, ChangeEvidence, ChangeTest
@@ -23,13 +25,15 @@ from servoscope.estimation.arm_regression import (
     filter_arm_log,
 )
 from servoscope.isolation.candidate import Candidate, FaultEstimate
-from servoscope.signals.readers.arm_log import ArmRecording
+from servoscope.models.arm.dynamics import joint_positions
+from servoscope.signals.readers.arm_log import ArmRecording, read_arm_log
 
 MIN_CERTAINTY = 0.9  # probability from which a cause is named
 MIN_EXPLAINED = 0.5  # share of the evidence of an unknown change from which one cause is named all the same
 MIN_PROBABILITY = 0.01  # of a cause that is listed
 MIN_RIVAL_PROBABILITY = 0.05  # of a cause that the headline of an open answer lists
 MAX_FACTOR = 20.0  # power of ten up to which evidence is written
+YEAR_S = 365.25 * 86400.0  # in which one healthy window may be called changed
 ONSET_TAIL = 0.025  # probability on either side of an onset's interval
 ONSET_STEP_S = 0.2  # to which an onset is found: the filters leave no more
 MAX_ONSET_STEPS = 60  # of an onset's interval, longer ones where that is long
@@ -46,6 +50,51 @@ class ArmExamination(NamedTuple):
     outside: FloatArray  # torque that friction cannot explain, over half a second (n, M) [N m]
     evidence: ChangeEvidence | None
     events: list[ArmEvent]
+
+    def picture(self, baseline: ArmBaseline, diagnosis: Diagnosis) -> dict[str, Any]:
+        """Return where the joints are in the middle of the recording [m], and how likely each has changed."""
+        arm, q = baseline.model.arm, self.signals.q
+        odds = [
+            sum(candidate.probability for candidate in diagnosis.candidates if candidate.name.endswith(f" of {name}"))
+            for name in arm.names
+        ]
+        places = joint_positions(arm, q[len(q) // 2]).tolist()
+        return {"names": arm.names, "parents": arm.parents, "places": places, "odds": odds}
+
+
+class ArmWindow(NamedTuple):
+    """The diagnosis of one of many windows of samples."""
+
+    diagnosis: Diagnosis
+    examination: ArmExamination
+    start: float  # when the diagnosis' time is 0 [s]
+    excess: float | None  # evidence of a change over its limit; None where the arm did not move
+
+
+@with_one_blas_thread
+def examine_window(baseline: ArmBaseline, name: str, t: FloatArray, signals: Mapping[str, FloatArray]) -> ArmWindow:
+    """Examine one of the windows that follow each other without end; the limit is for one false alarm a year.
+
+    `t`: (N,) [s]; `signals`: by their names in `ArmBaseline.logged_covariates`, (N,) each. Evidence is a Bayes factor,
+    so that no more than 1/k of healthy windows pass a limit that is k times as high. Raises RecordingError if the
+    samples cannot be used.
+    """
+    if lacking := [signal for signal in baseline.logged_covariates if signal not in signals]:
+        raise RecordingError(f"{name}: has no {', '.join(lacking)}, name columns as in the loop file of the arm")
+    whole = np.isfinite([t, *signals.values()]).all(axis=0)
+    if not whole.any():
+        raise RecordingError(f"{name}: no sample has all signals of all joints")
+    start, end = t[whole][[0, -1]].tolist()
+    looks = YEAR_S / max(end - start, 1.0)
+    limit = baseline.limit + max(0.0, float(np.log(looks * baseline.loop.false_alarms)))
+    raised = baseline.model_copy(update={"limit": limit})
+    try:
+        recording = read_arm_log({"t": t - start, **signals}, baseline.loop.of_channels(), baseline.model.arm)
+    except RecordingError as error:
+        raise RecordingError(f"{name}: {str(error).removeprefix('arrays: ')}") from None
+    diagnosis, exam = examine_arm(raised, replace(recording, name=name))
+    excess = None if exam.evidence is None else max(exam.evidence.log_factor, 0.0) / limit
+    return ArmWindow(diagnosis, exam, start, excess)
 
 
 @with_one_blas_thread
@@ -273,7 +322,7 @@ def _onset_interval(t: FloatArray, onset: FloatArray) -> tuple[tuple[float, floa
 
 def _fault(baseline: ArmBaseline, found: CauseEvidence) -> FaultEstimate | None:
     """Return a cause with its size; None of a change that is not known."""
-    kind, joint = found.cause.kind, found.cause.joint
+    kind, joint, name = found.cause.kind, found.cause.joint, found.cause.name
     if kind == UNKNOWN:
         return None
     value, low, high = _interval(baseline, found)
@@ -281,19 +330,19 @@ def _fault(baseline: ArmBaseline, found: CauseEvidence) -> FaultEstimate | None:
         link = float(baseline.model.arm.inertial[-1, 0])
         ratios = 1.0 + np.array([value, low, high]) / link
         return FaultEstimate(
-            name=kind, parameter="payload", ratio=ratios[0], interval=tuple(ratios[1:]), mass_kg=(value, low, high)
+            name=name, parameter="payload", ratio=ratios[0], interval=tuple(ratios[1:]), mass_kg=(value, low, high)
         )
     own = f"{joint}.{found.cause.parameter}"
     if kind == "friction":
         unit = baseline.coefficient(own)[0]
     elif kind == "drive gain":  # torque per current that is logged: the residual grows as the gain falls
         ratio, least, most = (1.0 / (1.0 + x) for x in (value, high, low))
-        return FaultEstimate(name=kind, parameter=own, ratio=ratio, interval=(least, most))
+        return FaultEstimate(name=name, parameter=own, ratio=ratio, interval=(least, most))
     else:  # without a healthy value of its own
         unit = baseline.torque[baseline.model.arm.names.index(joint)] if kind != "encoder offset" else 1.0
     ratios = 1.0 + np.array([value, low, high]) / unit
     return FaultEstimate(
-        name=kind, parameter=own, ratio=ratios[0], interval=(float(ratios[1:].min()), float(ratios[1:].max()))
+        name=name, parameter=own, ratio=ratios[0], interval=(float(ratios[1:].min()), float(ratios[1:].max()))
     )
 
 

@@ -29,6 +29,9 @@ def quantity_name(fault: FaultEstimate) -> Message | str:
     """Return the quantity that rises or falls with a fault."""
     if f"quantity.{fault.name}" in catalogue():
         return message(f"quantity.{fault.name}")
+    kind, of, joint = fault.name.partition(" of ")
+    if of:
+        return message("quantity.of_joint", kind=kind, joint=joint)
     if fault.name == fault.parameter:
         return fault_label(fault.name)
     return message("quantity.other", name=fault_label(fault.name), parameter=fault.parameter)

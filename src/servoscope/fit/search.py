@@ -24,6 +24,7 @@ FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-9, 1e6
 DAMPING_FACTOR = 10.0
 CANNOT_RUN = (ValueError, np.linalg.LinAlgError, SimulationError)
 MIN_INFORMATION = 1e-300
+MAX_REFINEMENTS = 500  # steps between two points of a grid
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +37,9 @@ class Experiment:
     low: float | FloatArray = -np.inf  # low, high: bounds of the unknowns
     high: float | FloatArray = np.inf
     difference: float | FloatArray = DIFFERENCE
+    max_step: float | FloatArray = MAX_STEP
+    # derivatives of the residual by the free unknowns, (m,) and (k,) -> (N, k); by differences if None
+    derivatives: Callable[[FloatArray, IndexArray], FloatArray] | None = None
 
     def at(self, x: FloatArray, free: IndexArray | None = None) -> Fit:
         """Return what some unknowns explain; the cost of a plant that cannot run is infinite.
@@ -75,6 +79,8 @@ class Fit:
     def jacobian(self) -> FloatArray:
         """Derivatives of the residual by the unknowns that are free, shape (N, k)."""
         experiment, m = self.experiment, len(self.x)
+        if experiment.derivatives is not None:
+            return experiment.derivatives(self.x, self.free)
         steps = np.broadcast_to(experiment.difference, m)
         steps = np.where(self.x + steps > experiment.high, -steps, steps)
         columns = [
@@ -116,8 +122,10 @@ def fit(
     tolerance: float = COST_TOLERANCE,
 ) -> Fit:
     """Search from a start; unknowns that are not `free` stay where they are."""
-    at, damping = experiment.at(np.asarray(start, dtype=np.float64), free), FIRST_DAMPING
-    low, high = (np.broadcast_to(bound, at.x.shape)[at.free] for bound in (experiment.low, experiment.high))
+    at, damping = experiment.at(np.clip(start, experiment.low, experiment.high), free), FIRST_DAMPING
+    low, high, longest = (
+        np.broadcast_to(bound, at.x.shape)[at.free] for bound in (experiment.low, experiment.high, experiment.max_step)
+    )
     for _ in range(steps):
         if not np.isfinite(at.cost):
             break
@@ -130,7 +138,8 @@ def fit(
         g, H, before = g[inside], H[np.ix_(inside, inside)], at.cost
         while damping < MAX_DAMPING and len(g):
             x, moved = at.x.copy(), z.copy()
-            moved[inside] += np.clip(np.linalg.solve(H + damping * np.diag(np.diag(H)), -g), -MAX_STEP, MAX_STEP)
+            step = np.linalg.solve(H + damping * np.diag(np.maximum(np.diag(H), MIN_INFORMATION)), -g)
+            moved[inside] += np.clip(step, -longest[inside], longest[inside])
             x[at.free] = np.clip(moved, low, high)
             after = experiment.at(x, at.free)
             if after.cost < at.cost:
@@ -140,3 +149,15 @@ def fit(
         if before - at.cost < tolerance:
             break
     return at
+
+
+def minimise_from_grid(
+    cost: Callable[[float], float], grid: FloatArray, xatol: float, steps: int = MAX_REFINEMENTS
+) -> float:
+    """Return where a cost is smallest: at the best point of a grid, or refined between the points beside it."""
+    from scipy.optimize import minimize_scalar
+
+    at = int(np.argmin([cost(float(x)) for x in grid]))
+    bracket = float(grid[max(at - 1, 0)]), float(grid[min(at + 1, len(grid) - 1)])
+    refined = minimize_scalar(cost, bounds=bracket, method="bounded", options={"xatol": xatol, "maxiter": steps})
+    return min((float(grid[at]), float(refined.x)), key=cost)

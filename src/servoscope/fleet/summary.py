@@ -180,7 +180,7 @@ def _summarise_asset(
     faults = diagnosis.get("faults") or ()
     best = next(iter(faults), None)
     onset = diagnosis.get("onset_s")
-    own = 0.0
+    own = diagnosis.get("probability") or 0.0 if diagnosis.get("verdict") == "fault" else 0.0  # of an arm
     if "evidence" in entry:
         own = cause[1] if cause is not None else fault_probability(_parse_evidence(entry), prior)
     before = [state for day, state in sorted(days.items()) if day < entry["day"]]

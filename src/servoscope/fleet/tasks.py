@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from servoscope.baseline.arm import ArmBaseline
 from servoscope.core.errors import NotEnoughError, ServoscopeError
 from servoscope.core.files import atomic_write, make_folder
 from servoscope.core.workers import Progress, WorkerError, Workers
@@ -121,6 +122,8 @@ class ExamineTask:
         try:
             if self.baseline is None:
                 raise ServoscopeError(f"no baseline: {self.baseline_error}")
+            if (of_arm := ArmBaseline.load(self.baseline)) is not None:
+                return self._stamp(self._examine_arm(of_arm))
             point = dict(self.item.groups).get(POINT)
             monitor = load_day_monitor(self.baseline, self.assets, self.window_s, point)
             learned = monitor.baseline.loop.columns
@@ -134,6 +137,16 @@ class ExamineTask:
             result = json.loads(json.dumps(result, allow_nan=False))
         except Exception as error:  # garbage in one item must not cost another
             result = failed_result(error)
+        return self._stamp(result)
+
+    def _examine_arm(self, baseline: ArmBaseline) -> dict[str, Any]:
+        from servoscope.fleet.arm_day import examine_arm_day
+
+        if self.columns is not None or POINT in dict(self.item.groups):
+            raise ServoscopeError("an arm has no operating points and no --columns: its loop file names its columns")
+        return examine_arm_day(baseline, self.item.files, self.window_s)
+
+    def _stamp(self, result: Mapping[str, Any]) -> dict[str, Any]:
         return {"asset": self.item.asset, "day": self.item.day, "stamp": self.item.stamp, **result}
 
 
@@ -165,8 +178,7 @@ def crash_result(task: Task) -> dict[str, Any]:
     error = "its process died, perhaps for want of memory"
     if isinstance(task, LearnTask):
         return {"name": task.name, "error": error, "unused": {}}
-    item = task.item
-    return {"asset": item.asset, "day": item.day, "stamp": item.stamp, "status": "failed", "error": error}
+    return task._stamp({"status": "failed", "error": error})
 
 
 def examine_day(monitor: DayMonitor, blocks: Iterable[Rows]) -> tuple[dict[str, Any], list[EvaluationBlock]]:

@@ -9,11 +9,13 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
+from servoscope.fit.search import minimise_from_grid
 from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
 from servoscope.isolation.posterior import Posterior
 from servoscope.isolation.signature import Signature
 
 GRID_POINTS = 17  # points along a signature before the minimum is refined
+RELATIVE_PRECISION = 1e-4  # of the minimum, relative to two steps of the grid
 MISFIT_BY_CHANCE = 1e-3  # probability with which the true fault may fit worse than the limit
 INFINITE_MISFIT = 1e12  # stands for an infinite misfit
 MAX_EXCESS_MISFIT = 200.0  # excess misfit from which a signature is not refined
@@ -147,17 +149,12 @@ class _SignatureSearch:
         return min(J for J, _ in self.cache.values())
 
     def _refine(self, steps: int) -> None:
-        from scipy import optimize
-
         grid = np.linspace(self.signature.low, self.signature.high, GRID_POINTS)
-        i = int(np.argmin([self.misfit_at(float(x)) for x in grid]))
-        bracket = (float(grid[max(i - 1, 0)]), float(grid[min(i + 1, GRID_POINTS - 1)]))
-        fine = 1e-4 * (bracket[1] - bracket[0])
 
         def misfit(x: float) -> float:  # a parabola through infinity is none: a loop that cannot run is far away
             return min(self.misfit_at(x), INFINITE_MISFIT)
 
-        optimize.minimize_scalar(misfit, bounds=bracket, method="bounded", options={"xatol": fine, "maxiter": steps})
+        minimise_from_grid(misfit, grid, RELATIVE_PRECISION * (grid[2] - grid[0]), steps)
 
     def fit(self, fine: bool) -> _SignatureFit:
         """Refine the minimum and integrate over the prior."""

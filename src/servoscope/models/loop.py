@@ -341,7 +341,7 @@ class Loop(ShortRepr, Settings):
             raise LoopError(f"{source}: must be a table of settings, found {type(mapping).__name__}")
         data = dict(mapping)
         if data.get("kind") == "arm":
-            raise LoopError(f"{source}: describes an arm, which learn and diagnose take, and no other command")
+            raise LoopError(f"{source}: describes an arm, which learn and diagnose take, and services its baseline")
         if isinstance(data.get("plant"), Mapping):
             data["plant"] = _parse_plant_table(data["plant"], source)
         try:

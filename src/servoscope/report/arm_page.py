@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,6 @@ from servoscope.baseline.arm import ArmBaseline
 from servoscope.core.messages import translate
 from servoscope.diagnosis.arm import ArmExamination
 from servoscope.diagnosis.result import Diagnosis
-from servoscope.models.arm.dynamics import joint_positions
 from servoscope.report.page import render_page, say, write_page
 
 if TYPE_CHECKING:
@@ -29,9 +29,8 @@ def render_arm_page(diagnosis: Diagnosis, examination: ArmExamination, baseline:
     """Return the page; it needs nothing from outside, no script and no network."""
     from servoscope.report.plotting import render_svg  # late: matplotlib takes half a second to import
 
-    odds = joint_odds(diagnosis, baseline.model.arm.names)
     figures = [
-        ("The arm and its joints", say("arm.page_joints"), plot_arm(examination, baseline, odds)),
+        ("The arm and its joints", say("arm.page_joints"), plot_arm(**examination.picture(baseline, diagnosis))),
         ("Torque from outside or unexplained", say("arm.page_torque"), plot_torque(examination, baseline, diagnosis)),
     ]
     return render_page(
@@ -46,31 +45,23 @@ def render_arm_page(diagnosis: Diagnosis, examination: ArmExamination, baseline:
     )
 
 
-def joint_odds(diagnosis: Diagnosis, names: tuple[str, ...]) -> list[float]:
-    """Return the probability that each joint has changed."""
-    return [
-        sum(candidate.probability for candidate in diagnosis.candidates if candidate.name.endswith(f" of {name}"))
-        for name in names
-    ]
-
-
-def plot_arm(examination: ArmExamination, baseline: ArmBaseline, odds: list[float]) -> Figure:
-    """Draw the arm as in the middle of the recording, its joints filled by their probability of a change."""
+def plot_arm(
+    names: Sequence[str], parents: Sequence[int], places: Sequence[Sequence[float]], odds: Sequence[float]
+) -> Figure:
+    """Draw the arm with its joints at these places [m], filled by their probability of a change."""
     from matplotlib.figure import Figure as NewFigure
 
     from servoscope.report.plotting import COLOURS, plot_style
 
-    arm, q = baseline.model.arm, examination.signals.q
-    places = joint_positions(arm, q[len(q) // 2])
     with plot_style():
         figure = NewFigure(figsize=(7.0, 3.2), layout="constrained")
         axes: Any = figure.add_subplot(projection="3d")
         for j, place in enumerate(places):
-            start = places[arm.parents[j]] if arm.parents[j] >= 0 else np.zeros(3)
+            start = places[parents[j]] if parents[j] >= 0 else (0.0, 0.0, 0.0)
             axes.plot(*np.column_stack([start, place]), color=COLOURS["muted"], linewidth=3.0)
             fill = COLOURS["alarm"] if odds[j] >= 0.5 else COLOURS["care"] if odds[j] >= 0.05 else COLOURS["healthy"]
-            axes.plot(*place[:, None], "o", color=fill, markersize=7.0)
-            axes.text(*place, f"  {arm.names[j]}", fontsize=7.5)
+            axes.plot(*np.array(place)[:, None], "o", color=fill, markersize=7.0)
+            axes.text(*place, f"  {names[j]}", fontsize=7.5)
         axes.set_axis_off()
         axes.set_aspect("equal")
     return figure

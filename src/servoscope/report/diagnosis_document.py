@@ -93,6 +93,7 @@ def _sections(d: Diagnosis, known: DiagnosisContext) -> Document:
         Section("What to check", tuple(_checks(d, known)), HEADLINE),
         Section("When it was there", _timeline(d, known), EVIDENCE),
         Section("What else it could be", tuple(_explanations(d, known)), EVIDENCE, _other_causes(d)),
+        Section("The arm and its joints", (PicturePart("arm"),), EVIDENCE, say("arm.page_joints")),
         Section("Signals", (PicturePart("signals"),), EVIDENCE, say("report.signals")),
         Section("Warnings", _warnings(d, known), EVIDENCE, "What the reader should know about the recording."),
         Section("Why", _reasons(d), DETAILS, _clock_note(known)),
@@ -163,8 +164,7 @@ def _fault_facts(d: Diagnosis, known: DiagnosisContext) -> Iterator[Fact]:
         yield Fact("Since when", likely, (say("report.interval", low=low, high=high), *seen))
     elif seen:
         yield Fact("Since when", "not known", seen)
-    for fault in d.faults:
-        yield size_fact(fault)
+    yield from map(size_fact, d.faults)
     if d.faults:
         among = "report.among_pairs" if d.refit is not None else "report.among"
         yield Fact("How sure", format_probability(d.probability), (say(among),))

@@ -11,14 +11,15 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
+from servoscope.baseline.arm import AnyBaseline, ArmBaseline, load_baseline
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import BaselineError, ConfigError, LoopError
 from servoscope.core.settings_errors import suggest_name
 from servoscope.design.operating_limits import LimitKind, OperatingLimit, operating_limits
 from servoscope.diagnosis.monitor import Monitor
-from servoscope.models.loop import Loop
 from servoscope.service.actions import CommandSettings, EmailSettings, WebhookSettings
 from servoscope.service.actions.settings import SINKS, Sink
+from servoscope.service.assets.arm_asset import ArmAsset
 from servoscope.service.assets.asset import Asset, AssetPolicy
 from servoscope.service.assets.checkpoint import StreamPosition, unpack_state
 from servoscope.service.assets.examination import compile_examination
@@ -172,30 +173,25 @@ def build_assets(config: ServiceFile) -> dict[str, Asset]:
         config.prognosis,
         assets=len(config.assets),
     )
-    files: dict[Path, Baseline] = {}
+    files: dict[Path, AnyBaseline] = {}
     shared: dict[tuple[Path, str | None], tuple[Baseline, Monitor]] = {}
     resolved: dict[object, AssetLimits] = {}
-    assets = {}
+    assets = dict[str, Asset]()
     for name, settings in config.assets.items():
         path, point = config.baseline_file(name), settings.point
         if path not in files:
             try:
-                files[path] = Baseline.load(path)
+                files[path] = load_baseline(path)
             except BaselineError as error:
                 raise ConfigError(f"[assets] {name}.baseline: {error}") from None
-        if (path, point) not in shared:
-            try:
-                baseline = files[path] if point is None else files[path].at(point)
-            except BaselineError as error:
-                raise ConfigError(f"[assets] {name}.point: {path.name}: {error}") from None
-            try:
-                shared[path, point] = baseline, Monitor(baseline)
-            except BaselineError as error:
-                if points := ", ".join(baseline.points):
-                    raise ConfigError(f"[assets] {name}.point: missing, {path.name} has {points}: choose one") from None
-                raise ConfigError(f"[assets] {name}.baseline: {path.name}: {error}") from None
-        _check_covariates(config, name, shared[path, point][0])
-        faults = [fault.name for fault in shared[path, point][0].loop.plant.all_faults]
+        learned = files[path]
+        if isinstance(learned, Baseline) and (path, point) not in shared:
+            shared[path, point] = _follow_point(learned, point, name, path.name)
+        elif isinstance(learned, ArmBaseline) and point is not None:
+            raise ConfigError(f"[assets] {name}.point: {path.name}: an arm has no operating points, leave it out")
+        baseline: AnyBaseline = learned if isinstance(learned, ArmBaseline) else shared[path, point][0]
+        _check_covariates(config, name, baseline)
+        faults = baseline.fault_names
         if settings.limits is None:
             limits = {fault: limit for fault, limit in config.prognosis.limits.items() if fault in faults}
         else:
@@ -203,21 +199,38 @@ def build_assets(config: ServiceFile) -> dict[str, Asset]:
             _check_names(f"[assets] {name}.limits", f"fault of {name}", limits, faults)
         asked = path, point, frozenset(limits.items())
         if asked not in resolved:  # many assets are of one loop
-            resolved[asked] = _resolve_limits(shared[path, point][0].loop, limits, name)
+            resolved[asked] = _resolve_limits(baseline, limits, name)
         policy = replace(policy, limits=resolved[asked], pause_s=config.sources[settings.source].pause_s)
-        assets[name] = Asset(name, *shared[path, point], policy, settings.group, settings.source)
-    known = [fault.name for asset in assets.values() for fault in asset.baseline.loop.plant.all_faults]
+        place = settings.group, settings.source
+        if isinstance(learned, ArmBaseline):
+            assets[name] = ArmAsset(name, learned, policy, *place)
+        else:
+            assets[name] = Asset(name, *shared[path, point], policy, *place)
+    known = [fault for asset in assets.values() for fault in asset.baseline.fault_names]
     _check_names("[prognosis] limits", "fault", config.prognosis.limits, known)
     for asset in {id(asset.baseline): asset for asset in assets.values()}.values():
         asset.compile_kernels()
-    for asset in {
-        asset.monitor.lane_key or asset.baseline.loop.plant.kind: asset for asset in assets.values()
-    }.values():
-        compile_examination(asset.baseline)  # one of each kind: its kernels are those of all others
+    kinds = {monitor.lane_key or one.loop.plant.kind: one for one, monitor in shared.values()}
+    for one in kinds.values():
+        compile_examination(one)  # one of each kind: its kernels are those of all others
     return assets
 
 
-def _check_covariates(config: ServiceFile, name: str, baseline: Baseline) -> None:
+def _follow_point(learned: Baseline, point: str | None, asset: str, file: str) -> tuple[Baseline, Monitor]:
+    """Return the baseline of an operating point, and its monitor; raises ConfigError if it has no such point."""
+    try:
+        baseline = learned if point is None else learned.at(point)
+    except BaselineError as error:
+        raise ConfigError(f"[assets] {asset}.point: {file}: {error}") from None
+    try:
+        return baseline, Monitor(baseline)
+    except BaselineError as error:
+        if points := ", ".join(baseline.points):
+            raise ConfigError(f"[assets] {asset}.point: missing, {file} has {points}: choose one") from None
+        raise ConfigError(f"[assets] {asset}.baseline: {file}: {error}") from None
+
+
+def _check_covariates(config: ServiceFile, name: str, baseline: AnyBaseline) -> None:
     """Raise ConfigError if an asset's source does not carry what its baseline depends on."""
     asset = config.assets[name]
     source, key = config.sources[asset.source], config.sources[asset.source].asset_key
@@ -239,16 +252,20 @@ def _check_covariates(config: ServiceFile, name: str, baseline: Baseline) -> Non
         )
 
 
-def _resolve_limits(loop: Loop, limits: Mapping[str, float | LimitKind], asset: str) -> AssetLimits:
+def _resolve_limits(baseline: AnyBaseline, limits: Mapping[str, float | LimitKind], asset: str) -> AssetLimits:
     """Return limits with what a loop loses in place of its name; raises ConfigError where no size takes that."""
     resolved: dict[str, float | OperatingLimit] = {}
     for fault, limit in limits.items():
         if not isinstance(limit, str):
             resolved[fault] = limit
             continue
+        if isinstance(baseline, ArmBaseline):
+            raise ConfigError(f'limits of {asset}: {fault} = "{limit}": not known of an arm, give a number')
         try:
             operating_limit = next(
-                operating_limit for operating_limit in operating_limits(loop, [fault]) if operating_limit.kind == limit
+                operating_limit
+                for operating_limit in operating_limits(baseline.loop, [fault])
+                if operating_limit.kind == limit
             )
         except LoopError as error:
             raise ConfigError(f'limits of {asset}: {fault} = "{limit}": {error}') from None
@@ -267,7 +284,11 @@ def source_assets(config: ServiceFile, assets: Mapping[str, Asset], source: str)
         if asset.source == source:
             baseline, address = assets[name].baseline, getattr(asset, key) if key else None
             found[name] = SourceAsset(
-                baseline.loop, address, config.service.ahead_s, covariates=baseline.logged_covariates
+                baseline.loop.carrier if isinstance(baseline, ArmBaseline) else baseline.loop,
+                address,
+                config.service.ahead_s,
+                baseline.logged_covariates,
+                is_arm=isinstance(baseline, ArmBaseline),
             )
     return found
 
@@ -307,9 +328,8 @@ def check_actions(config: ServiceFile, assets: Mapping[str, Asset]) -> None:
         _check_names(f"{where}.assets", "asset", fault_tolerance_settings.assets, assets)
         for asset in fault_tolerance_settings.assets:
             baseline = assets[asset].baseline
-            faults = [fault.name for fault in baseline.loop.plant.all_faults] + [
-                fault.name for fault in baseline.learned
-            ]
+            learned = () if isinstance(baseline, ArmBaseline) else (fault.name for fault in baseline.learned)
+            faults = [*baseline.fault_names, *learned]
             _check_names(f"{where}.fault", f"fault of {asset}", [fault_tolerance_settings.fault], faults)
 
 

@@ -8,6 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any
 
+from servoscope.baseline.arm import AnyBaseline, ArmBaseline
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.workers import WorkerError, Workers
 from servoscope.design.operating_limits import OperatingLimit
@@ -34,7 +35,7 @@ class DiagnosisWorker:
         self._workers = Workers()
         self._closed = False
 
-    def submit(self, baseline: Baseline, name: str, blocks: Sequence[Block]) -> Future[StoredDiagnosis]:
+    def submit(self, baseline: AnyBaseline, name: str, blocks: Sequence[Block]) -> Future[StoredDiagnosis]:
         """Ask for the diagnosis of a window."""
         return self._executor.submit(self._diagnose, baseline, name, list(blocks))
 
@@ -55,7 +56,7 @@ class DiagnosisWorker:
         self._workers.close()
         self._executor.shutdown(wait=True, cancel_futures=True)
 
-    def _diagnose(self, baseline: Baseline, name: str, blocks: list[Block]) -> StoredDiagnosis:
+    def _diagnose(self, baseline: AnyBaseline, name: str, blocks: list[Block]) -> StoredDiagnosis:
         text = json.dumps(baseline.model_dump(mode="json", by_alias=True))
         packed = [(block.sequence, block.pack()) for block in blocks]
         for _ in range(MAX_ATTEMPTS):
@@ -89,5 +90,6 @@ def diagnose_packed_blocks(
 
 
 @lru_cache(MAX_CACHED_BASELINES)
-def _parse_baseline(text: str) -> Baseline:
-    return Baseline.model_validate(json.loads(text))
+def _parse_baseline(text: str) -> AnyBaseline:
+    content = json.loads(text)
+    return (ArmBaseline if "urdf" in content else Baseline).model_validate(content)

@@ -12,6 +12,7 @@ from servoscope.core.errors import BaselineError
 from servoscope.core.messages import translate
 from servoscope.diagnosis.change_words import fault_label
 from servoscope.diagnosis.checks import checks_of_fault, suspects
+from servoscope.models.arm.settings import ArmLoop
 from servoscope.models.loop import Loop
 from servoscope.service.assets.status import AssetStatus
 from servoscope.service.store import Row, tables
@@ -44,7 +45,7 @@ def asset_checks(context: Context, asset: str, status: AssetStatus, row: Row | N
     return checks
 
 
-def fault_checks(context: Context, asset: str, loop: Loop | None, names: Iterable[str]) -> list[FaultCheck]:
+def fault_checks(context: Context, asset: str, loop: Loop | ArmLoop | None, names: Iterable[str]) -> list[FaultCheck]:
     """Return what to check on an asset for each of these faults."""
     own, checks = read_checks(context.store, asset), []
     for name in names:
@@ -55,7 +56,7 @@ def fault_checks(context: Context, asset: str, loop: Loop | None, names: Iterabl
     return checks
 
 
-def asset_loop(context: Context, asset: str) -> Loop | None:
+def asset_loop(context: Context, asset: str) -> Loop | ArmLoop | None:
     """Return the loop that an asset is compared with; None where its baseline is not here."""
     id_ = asset_baseline_id(context, asset)
     if id_ is None:

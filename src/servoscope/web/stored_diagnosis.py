@@ -8,7 +8,8 @@ from typing import Any
 from servoscope.core.messages import Message, render
 from servoscope.diagnosis.result import Diagnosis
 
-STORED_BESIDE = "began", "signature", "said"  # keys of a stored document that are no fields of the diagnosis
+# keys of a stored document that are no fields of the diagnosis
+STORED_BESIDE = ("began", "signature", "said", "evidence", "arm")
 
 
 def read_diagnosis(document: Mapping[str, Any]) -> Diagnosis | None:

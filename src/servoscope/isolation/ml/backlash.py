@@ -12,7 +12,7 @@ from servoscope.core.jit.array_function import ArrayFunction
 from servoscope.core.jit.arrays import Variable
 from servoscope.fit.kernels import PlantArrays, input_before, restart_state, samples_since_restart
 from servoscope.fit.predictor import Predictor
-from servoscope.isolation.ml.least_squares import minimise_from_grid
+from servoscope.fit.search import minimise_from_grid
 from servoscope.isolation.ml.window import RefitWindow
 
 GAP_COUNT = 33  # gaps, in even ratios, before the best is refined

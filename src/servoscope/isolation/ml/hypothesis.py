@@ -8,19 +8,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
+from servoscope.fit.search import Experiment, fit
 from servoscope.isolation.ml.least_squares import explained_sum_of_squares, last_unknown_std
 from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow
 from servoscope.isolation.posterior import Posterior
 from servoscope.models.plants import Fault
 
-MAX_STEPS = 12  # of the search, at most
 MIN_SIZE_STDS = 3.0  # standard deviations below which a size is as good as none
 SIZE_STDS = 5.0  # standard deviations of the size over which its likelihood is integrated
 POINTS = 31
-BOUND_TOLERANCE = 1e-6
 BOUND_SHARE = 1e-3  # of the logarithmic range, within which a size lies at its end
-START_LOGARITHM = 1e-4  # of all logarithms where a search begins
-EPSILON = float(np.finfo(np.float64).eps)
+COST_TOLERANCES = 1e-4, 1e-7  # of the cost per sample: healthy parameters held, and free
 # of the sum of squares: what is further off than the best one has no probability worth telling
 MAX_EXCESS_SQUARES = 60.0
 
@@ -73,6 +71,22 @@ def log_ratio_bounds(faults: Sequence[Fault]) -> tuple[FloatArray, FloatArray]:
     return low, high
 
 
+def change_experiment(
+    window: ChangeWindow, faults: Sequence[Fault], profile: ChangeProfile, other: FloatArray | float = 0.0
+) -> Experiment:
+    """Return what is searched for z = [d, x]: innovations and prior, less those of another explanation, (N + m,)."""
+    names, anywhere = tuple(fault.parameter for fault in faults), np.full(window.nuisance_count, np.inf)
+    low, high = log_ratio_bounds(faults)
+    return Experiment(
+        lambda z: window.residual(z, names, profile) - other,
+        np.full(len(anywhere) + len(low), np.inf),  # the prior is among the residuals
+        low=np.append(-anywhere, low),
+        high=np.append(anywhere, high),
+        max_step=np.inf,
+        derivatives=lambda z, unknowns: window.jacobian(z, names, profile, unknowns),
+    )
+
+
 def fit_hypothesis(
     window: ChangeWindow,
     faults: Sequence[Fault],
@@ -86,54 +100,16 @@ def fit_hypothesis(
     `d`: errors of the healthy parameters, to begin with, shape (m,); `starts`: sizes at which the search begins,
     one (k,) each; the best end counts; `free`: whether d follows, within reason, or stays.
     """
-    from scipy.optimize import least_squares as minimise
-
-    names, m = tuple(fault.parameter for fault in faults), window.nuisance_count
-    held = 0 if free else m
-    low, high = log_ratio_bounds(faults)
-    lowest = np.concatenate([np.full(m, -np.inf), low])[held:]
-    highest = np.concatenate([np.full(m, np.inf), high])[held:]
-
-    def whole(z: FloatArray) -> FloatArray:
-        return z if free else np.concatenate([d, z])
-
-    def residual(z: FloatArray) -> FloatArray:
-        return window.residual(whole(z), names, profile)
-
-    def jacobian(z: FloatArray) -> FloatArray:
-        return window.jacobian(whole(z), names, profile, slice(held, None))
-
-    if not len(lowest):  # nothing is open
-        e = window.residual(d, names, profile)
-        return HypothesisFit((), profile, d, np.zeros(0), float(e @ e), np.zeros((0, 0)), np.zeros((len(e), 0)), e)
-    ends = []
-    for x in starts:
-        z = np.clip(np.concatenate([d, x])[held:], lowest + BOUND_TOLERANCE, highest - BOUND_TOLERANCE)
-        if np.abs(z).max() < START_LOGARITHM:  # the first step is as long as the start, and as long as it likes from 0
-            z = np.zeros_like(z)
-        try:
-            optimize_result = minimise(
-                residual,
-                z,
-                jacobian,
-                bounds=(lowest, highest),
-                x_scale="jac",
-                ftol=1e-7 if free else 1e-4,
-                xtol=1e-7 if free else 1e-4,
-                # only where nothing shows at all: the search divides by the length of a gradient that is zero
-                gtol=EPSILON,
-                max_nfev=MAX_STEPS,
-            )
-        except ValueError as error:  # residuals that are no numbers
-            raise np.linalg.LinAlgError(str(error)) from None
-        ends.append(optimize_result)
-    best = min(ends, key=lambda found: float(found.cost))
-    z, J = whole(np.asarray(best.x)), np.asarray(best.jac, dtype=np.float64)
-    H = J.T @ J
-    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
-    C = np.linalg.pinv(H / np.outer(size, size), rcond=1e-12, hermitian=True) / np.outer(size, size)
-    k = m - held  # rows of d, where it is free
-    return HypothesisFit(tuple(faults), profile, z[:m], z[m:], 2.0 * float(best.cost), C[k:, k:], J, best.fun)
+    experiment, m = change_experiment(window, faults, profile), window.nuisance_count
+    unknowns, tolerance = np.arange(0 if free else m, m + len(faults)), COST_TOLERANCES[free] * window.used
+    ends = [fit(experiment, np.append(d, x), unknowns, tolerance=tolerance) for x in starts]
+    best = min(ends, key=lambda end: end.cost)
+    if not np.isfinite(best.cost):
+        raise np.linalg.LinAlgError("no size can be simulated from which a search may begin")
+    z, k = best.x, len(unknowns) - len(faults)  # rows of d, where it is free
+    return HypothesisFit(
+        tuple(faults), profile, z[:m], z[m:], best.cost, best.covariance[k:, k:], best.jacobian, best.residual
+    )
 
 
 def refit_contenders_jointly(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
@@ -41,16 +39,6 @@ def solve_least_squares(J: FloatArray, residual: FloatArray) -> tuple[FloatArray
     Q, R = np.linalg.qr(each)
     step = -np.linalg.lstsq(R, Q.T @ residual, rcond=None)[0] / size
     return step, float(((residual + J @ step) ** 2).sum())
-
-
-def minimise_from_grid(cost: Callable[[float], float], grid: FloatArray, xatol: float) -> float:
-    """Return where a cost is smallest: at the best point of a grid, or refined between the points beside it."""
-    from scipy.optimize import minimize_scalar
-
-    at = int(np.argmin([cost(float(x)) for x in grid]))
-    bracket = float(grid[max(at - 1, 0)]), float(grid[min(at + 1, len(grid) - 1)])
-    refined = minimize_scalar(cost, bounds=bracket, method="bounded", options={"xatol": xatol})
-    return min((float(grid[at]), float(refined.x)), key=cost)
 
 
 def last_unknown_std(J: FloatArray) -> float:

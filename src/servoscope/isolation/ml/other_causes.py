@@ -11,9 +11,10 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message, text_message
 from servoscope.fit.predictor import Predictor
+from servoscope.fit.search import minimise_from_grid
 from servoscope.isolation.ml.backlash import backlash_of_width, fit_backlash
 from servoscope.isolation.ml.hypothesis import HypothesisFit
-from servoscope.isolation.ml.least_squares import minimise_from_grid, solve_least_squares
+from servoscope.isolation.ml.least_squares import solve_least_squares
 from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow, RefitWindow, delayed, speed_sign
 
 DELAY_COUNT = 9  # delays up to one further sample, before the best is refined

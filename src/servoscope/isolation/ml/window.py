@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 
 from servoscope.baseline.baseline import Baseline
-from servoscope.core.arrays import BoolArray, FloatArray, IntArray
+from servoscope.core.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.fit.kernels import Array
 from servoscope.fit.plant_experiment import plant_input
@@ -166,7 +166,7 @@ class ChangeWindow(abc.ABC):
         return np.asarray(self.residuals(z[None], names, profile)[0])
 
     def jacobian(
-        self, z: FloatArray, names: Sequence[str], profile: ChangeProfile, by: slice = slice(None)
+        self, z: FloatArray, names: Sequence[str], profile: ChangeProfile, by: slice | IndexArray = slice(None)
     ) -> FloatArray:
         """Return the derivatives of `residual` by the unknowns that `by` selects, shape (N + m, k).
 

@@ -16,7 +16,9 @@ from servoscope.core.settings import Finite, NonEmptyStr, NonNegative, Positive,
 from servoscope.core.settings_errors import describe_error
 from servoscope.models.arm.dynamics import STANDARD_GRAVITY
 from servoscope.models.arm.urdf import Kinematics, parse_urdf
+from servoscope.models.loop import Loop
 
+SIGNALS = ("position", "torque", "temperature")  # of a joint, each with a key of its table
 DEFAULT_CUTOFF = 5.0  # Hz; the motion of an arm lies below, the ripple of its gears above
 
 
@@ -122,6 +124,30 @@ class ArmLoop(Settings):
                 f" {', '.join(arm.names)}; make those fixed that no log has"
             )
         return arm
+
+    @property
+    def channels(self) -> dict[str, str]:
+        """The columns of all signals, by ``JOINT.position``, ``JOINT.torque`` and so on, and ``tool``."""
+        joints = ((f"{name}.{key}", getattr(joint, key)) for name, joint in self.joints.items() for key in SIGNALS)
+        return {name: column for name, column in (*joints, ("tool", self.tool)) if column is not None}
+
+    @property
+    def carrier(self) -> Loop:
+        """The first joint as a loop, whose log or messages carry the signals of all joints as covariates."""
+        first = next(iter(self.joints.values()))
+        columns = {"time": self.time, "time_unit": self.time_unit, "covariates": self.channels}
+        columns |= {"reference": first.position, "input": first.torque, "output": first.position}
+        plant = {"kind": "axis"}
+        return Loop.from_dict({"name": self.name, "sample_rate": self.sample_rate, "columns": columns, "plant": plant})
+
+    def of_channels(self) -> Self:
+        """Return it for columns that are called as `channels` says, and time in seconds in a column ``t``."""
+        joints = {
+            name: joint.model_copy(update={key: f"{name}.{key}" for key in SIGNALS if getattr(joint, key) is not None})
+            for name, joint in self.joints.items()
+        }
+        tool = None if self.tool is None else "tool"
+        return self.model_copy(update={"joints": joints, "tool": tool, "time": "t", "time_unit": "s"})
 
     def columns_of(self, arm: Kinematics) -> tuple[JointColumns, ...]:
         """Return the columns of the joints in the order of the arm."""

@@ -11,14 +11,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.arm import AnyBaseline
 from servoscope.core.errors import StateError
 from servoscope.core.messages import message, render
-from servoscope.diagnosis.monitor import Monitor
 from servoscope.diagnosis.schedule import DiagnosisSchedule
 from servoscope.prognosis.forecast import Prognosis
 from servoscope.service.alarms import AlarmSettings, AlarmTransition, OperatorCommand
 from servoscope.service.assets.alarms import AssetAlarms
+from servoscope.service.assets.arm_monitor import AnyMonitor
 from servoscope.service.assets.block_lanes import BlockLanes, Followed
 from servoscope.service.assets.checkpoint import AssetState, StreamPosition, evolve
 from servoscope.service.assets.examination import StoredDiagnosis, carry_covariates, examine_blocks
@@ -71,12 +71,17 @@ class AssetPolicy:
 class Asset(StateHolder):
     """Follows one asset.
 
-    `baseline`: of one operating point; `monitor`: of this baseline, shared by all assets that have it; `group`: what
-    the asset belongs to; `source`: what it comes from; both for users.
+    `baseline`: of one operating point; `monitor`: of it, shared; `group` and `source`, for users: what it belongs to.
     """
 
     def __init__(
-        self, name: str, baseline: Baseline, monitor: Monitor, policy: AssetPolicy, group: str = "", source: str = ""
+        self,
+        name: str,
+        baseline: AnyBaseline,
+        monitor: AnyMonitor,
+        policy: AssetPolicy,
+        group: str = "",
+        source: str = "",
     ) -> None:
         super().__init__()
         self.name, self.baseline, self.policy, self.source = name, baseline, policy, source
@@ -87,8 +92,7 @@ class Asset(StateHolder):
         self.lanes = BlockLanes(self._rate, self._limits, policy.residual_every_s)
         self._alarms = AssetAlarms(policy.alarms, policy.prognosis.ahead_s, limited=bool(policy.limits))
         self._window = RecentBlocks(name, policy.diagnosis.kept_s, self._rate)
-        self._result = StepResult([], [])
-        self._reception = RECEPTION_OK
+        self._result, self._reception = StepResult([], []), RECEPTION_OK
         self._ticked = False  # whether silence has changed the state since the last block
 
     def move_state(self, states: AssetStates, row: int) -> None:
@@ -211,8 +215,8 @@ class Asset(StateHolder):
 
     def follow(self, accepted: NextBlock) -> Followed:
         """Follow an accepted block alone."""
-        block, restart = accepted.block, accepted.continuity.is_broken
-        return self.lanes.follow(self.monitor, self.take_state(), block.signals, restart=restart)
+        restart = accepted.continuity.is_broken
+        return self.lanes.follow(self.monitor, self.take_state(), accepted.block.signals, restart=restart)
 
     def conclude(self, accepted: NextBlock, followed: Followed) -> StepResult:
         """Take what an accepted block has led to."""
@@ -281,11 +285,8 @@ class Asset(StateHolder):
         t, after_s, pending = self.t, self._schedule.after, self.pending_diagnoses
         # complete, or never to be because the clock was set back
         ready = [window for window in pending if ended or not window.until - after_s <= t < window.until]
-        return [
-            (window, self._carry_covariates(self._window.within(window)))
-            for window in ready
-            if (self.name, window) not in started
-        ]
+        new = [window for window in ready if (self.name, window) not in started]
+        return [(window, self._carry_covariates(self._window.within(window))) for window in new]
 
     def _carry_covariates(self, blocks: Sequence[Block]) -> Sequence[Block]:
         history = self.monitor.covariate_history(self.take_state().monitor)
@@ -311,10 +312,9 @@ class Asset(StateHolder):
         state = self.take_state()
         if window not in state.pending_diagnoses:
             return StepResult([], [])
-        examination, diagnosis = accept_diagnosis(
-            state.examination, window, diagnosis, first=self._is_first_diagnosis(window)
-        )
-        pending = tuple(pending_diagnose for pending_diagnose in state.pending_diagnoses if pending_diagnose != window)
+        first = self._is_first_diagnosis(window)
+        examination, diagnosis = accept_diagnosis(state.examination, window, diagnosis, first=first)
+        pending = tuple(each for each in state.pending_diagnoses if each != window)
         self.state = replace(state, examination=examination, pending_diagnoses=pending)
         values = {"number": window.number, "t": window.until, "grounds": window.why, **diagnosis.columns()}
         self._window.trim(self.take_state().position.t, self.take_state().pending_diagnoses)

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.monitor import Monitor
+from servoscope.service.assets.arm_monitor import AnyMonitor
 from servoscope.service.assets.checkpoint import AssetState, evolve
 from servoscope.service.assets.residual_history import (
     HistoryState,
@@ -106,7 +107,7 @@ class BlockLanes:
         self._rate, self._limits, self._residual_every_s = rate, limits, residual_every_s
         self._timebase = Timebase(1.0 / rate)
 
-    def follow(self, monitor: Monitor, state: AssetState, block: FloatArray, *, restart: bool) -> Followed:
+    def follow(self, monitor: AnyMonitor, state: AssetState, block: FloatArray, *, restart: bool) -> Followed:
         """Follow a block of one asset, in whatever order its samples are.
 
         `block`: t, r, u, y and covariates, shape (4 + k, N); `restart`: whether samples before it are missing.

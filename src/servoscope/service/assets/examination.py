@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from servoscope.baseline.arm import AnyBaseline, ArmBaseline
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.covariates import hold_last
 from servoscope.core.errors import RecordingError, ServoscopeError
@@ -83,7 +84,7 @@ def undetermined(key: str, **values: Any) -> StoredDiagnosis:
 
 
 def examine_blocks(
-    baseline: Baseline,
+    baseline: AnyBaseline,
     name: str,
     blocks: Sequence[Block],
     features: float | None = None,
@@ -100,6 +101,8 @@ def examine_blocks(
 
     Where the samples cannot be used, the verdict is ``undetermined`` and the headline has the reason.
     """
+    if isinstance(baseline, ArmBaseline):
+        return diagnose_blocks(baseline, name, blocks)
     if assess:
         result = examine_blocks(baseline, name, blocks, features, fault, known)
         return result.model_copy(update={"control": _assess_blocks(baseline, name, blocks)})
@@ -179,17 +182,20 @@ def _follow_size(exam: Examination, fault: str, first: int) -> FaultEstimate | N
     return best.faults[0] if best.name == fault else None
 
 
-def diagnose_blocks(baseline: Baseline, name: str, blocks: Sequence[Block]) -> StoredDiagnosis:
+def diagnose_blocks(baseline: AnyBaseline, name: str, blocks: Sequence[Block]) -> StoredDiagnosis:
     """Diagnose a window, refit included, which takes seconds.
 
-    The motion signature before and after the onset is the document's key ``signature``. Times in the document count
-    from the beginning of the window, its key ``began``; those of the headline are dates,
-    because months later nobody knows when the window began.
+    The motion signature before and after the onset is the document's key ``signature``; of an arm, ``evidence`` is that
+    of a change over its limit, and ``arm`` is how it is drawn. Times in the document count from the beginning
+    of the window, its key ``began``; those of the headline are dates, because months later nobody knows when the window
+    began.
     """
     from servoscope.diagnosis.diagnose import diagnose
     from servoscope.diagnosis.motion_signature import signature_columns
     from servoscope.diagnosis.verify import provenance
 
+    if isinstance(baseline, ArmBaseline):
+        return _diagnose_arm(baseline, name, blocks)
     try:
         recording, start = blocks_to_recording(baseline, name, blocks)
         diagnosis = diagnose(baseline, recording)
@@ -204,8 +210,24 @@ def diagnose_blocks(baseline: Baseline, name: str, blocks: Sequence[Block]) -> S
     return StoredDiagnosis(verdict=diagnosis.verdict, headline=headline, onset=onset, document=document)
 
 
+def _diagnose_arm(baseline: ArmBaseline, name: str, blocks: Sequence[Block]) -> StoredDiagnosis:
+    from servoscope.diagnosis.arm import examine_window
+
+    t, _, _, _, *signals = np.concatenate([block.signals for block in blocks], axis=1)
+    try:
+        window = examine_window(baseline, name, t, dict(zip(baseline.logged_covariates, signals, strict=True)))
+    except ServoscopeError as error:
+        return undetermined("unusable", error=str(error))
+    diagnosis, start = window.diagnosis, window.start
+    picture = window.examination.picture(baseline, diagnosis)
+    document = {**diagnosis.model_dump(mode="json"), "began": start, "evidence": window.excess, "arm": picture}
+    onset = start + diagnosis.onset_s[1] if diagnosis.onset_s is not None else None
+    headline = diagnosis.dated_headline(start)
+    return StoredDiagnosis(verdict=diagnosis.verdict, headline=headline, onset=onset, document=document)
+
+
 def carry_covariates(
-    baseline: Baseline, blocks: Sequence[Block], history: CovariateHistory, now: float
+    baseline: AnyBaseline, blocks: Sequence[Block], history: CovariateHistory, now: float
 ) -> Sequence[Block]:
     """Return blocks with what a monitor knows at `now` [UTC s] of covariates of which they have no value themselves."""
     if not history or not blocks:

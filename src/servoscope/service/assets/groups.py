@@ -65,7 +65,7 @@ class AssetGroups:
         kinds: dict[int, Hashable | None] = {}  # of the monitors, which assets share
         for monitor in {id(asset.monitor): asset.monitor for asset in assets.values()}.values():
             kinds[id(monitor)] = key = monitor.lane_key
-            if key is not None:
+            if isinstance(monitor, Monitor) and key is not None:
                 monitors[key][id(monitor)] = monitor
         members: dict[Hashable, list[str]] = defaultdict(list)
         for name, asset in assets.items():

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.arm import AnyBaseline, ArmBaseline
 from servoscope.baseline.records import Occasion
 from servoscope.core.messages import message, render
 from servoscope.diagnosis.result import Verdict
@@ -152,21 +152,25 @@ def read_status(stored: Mapping[str, Any]) -> AssetStatus | ServiceStatus:
     return (ServiceStatus if stored.get("service") else AssetStatus).model_validate(stored)
 
 
-def asset_metadata(baseline: Baseline, group: str, window_s: float, source: str = "") -> AssetMetadata:
+def asset_metadata(baseline: AnyBaseline, group: str, window_s: float, source: str = "") -> AssetMetadata:
     """Return the metadata of an asset with this baseline."""
-    loop = baseline.loop
+    kind: dict[str, Any] = {
+        "plant": "arm",
+        "faults": dict(zip(baseline.fault_names, baseline.fault_names, strict=True)),
+    }
+    if not isinstance(baseline, ArmBaseline):
+        plant = baseline.loop.plant
+        units = {"units": tuple(plant.units), "coefficient_units": tuple(plant.coefficient_units)}
+        faults = {fault.name: fault.words for fault in plant.all_faults}
+        kind = {"plant": plant.kind, "point": baseline.point or None, "faults": faults, **units}
     return AssetMetadata(
         group=group,
         source=source,
-        loop=loop.name,
-        plant=loop.plant.kind,
+        loop=baseline.loop.name,
         baseline=baseline.hash,
-        point=baseline.point or None,
-        sample_rate_hz=loop.sample_rate,
-        units=tuple(loop.plant.units),
-        coefficient_units=tuple(loop.plant.coefficient_units),
-        faults={fault.name: fault.words for fault in loop.plant.all_faults},
+        sample_rate_hz=baseline.loop.sample_rate,
         window_s=window_s,
+        **kind,
     )
 
 

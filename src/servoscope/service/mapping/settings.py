@@ -116,8 +116,10 @@ class PayloadSettings(Settings):
         signal = [SIGNAL in inside or SIGNAL in TextPattern(topic).names for topic in self.topics]
         if any(signal) and not all(signal):
             raise ValueError("topics: {signal} must stand in all of them, or in none")
-        if len(set(self.fields.all)) < len(self.fields.all):
-            raise ValueError("fields: r, u, y and covariates must all be different ones")
+        own, carried = self.fields.all[:3], self.fields.all[3:]
+        for names in (self.fields.all,) if any(signal) else (own, carried):  # of an arm r, u, y stand under both
+            if len(set(names)) < len(names):
+                raise ValueError("fields: r, u and y must be different ones, and so must covariates")
         if strange := set(self.scale.covariates) - set(self.fields.covariates):
             raise ValueError(f"scale.covariates: {min(strange)} does not stand under fields.covariates")
         if self.value and not any(signal):

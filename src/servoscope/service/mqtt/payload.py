@@ -72,17 +72,20 @@ def _plain_column(values: FloatArray) -> list[float | None]:
     return [x if math.isfinite(x) else None for x in values.tolist()]
 
 
-def decode_block(asset: str, message: bytes, received_at: float = 0.0, covariates: Sequence[str] = ()) -> Block:
+def decode_block(
+    asset: str, message: bytes, received_at: float = 0.0, covariates: Sequence[str] = (), *, is_arm: bool = False
+) -> Block:
     """Return the block of a message, binary or JSON, that came at `received_at` by the monotonic clock [s].
 
-    `covariates`: names of the further columns that it must have; without them, further columns are left out. Memory is
-    allocated for what is there, not for what a header announces. Raises MessageError if it is no block.
+    `covariates`: names of the further columns that it must have; without them, further columns are left out; `is_arm`:
+    JSON may leave out r, u and y, for which the first covariate stands. Memory is allocated for what is there, not for
+    what a header announces. Raises MessageError if it is no block.
     """
     if message[:4] == MAGIC:
         return _decode_binary(asset, message, received_at, covariates)
     if message[:1] in (b"{", b" ", b"\n", b"\r", b"\t"):
         block = None if covariates else _decode_regular(asset, message, received_at)
-        return _decode_json(asset, message, received_at, covariates) if block is None else block
+        return _decode_json(asset, message, received_at, covariates, is_arm=is_arm) if block is None else block
     raise MessageError("not a block", f"begins with {message[:8]!r}: neither a binary block nor a JSON object")
 
 
@@ -142,7 +145,7 @@ def _decode_regular(asset: str, message: bytes, received_at: float) -> Block | N
     return _build_block(asset, stream, sequence, oldest if "oldest" in keys else None, signals, received_at)
 
 
-def _decode_json(asset: str, message: bytes, received_at: float, covariates: Sequence[str]) -> Block:
+def _decode_json(asset: str, message: bytes, received_at: float, covariates: Sequence[str], *, is_arm: bool) -> Block:
     try:
         plain = parse_json(message)
     except (ValueError, RecursionError) as error:
@@ -161,6 +164,7 @@ def _decode_json(asset: str, message: bytes, received_at: float, covariates: Seq
         if not isinstance(named, dict) or not set(covariates) <= set(named):
             raise MessageError("covariates", f"covariates: missing, expected {', '.join(covariates)}")
         columns |= {f"covariates.{name}": named[name] for name in covariates}
+        columns = {**dict.fromkeys("ruy", named[covariates[0]]), **columns} if is_arm else columns
     numbers = np.stack(_parse_columns(columns, ("r", "u", "y", *(f"covariates.{name}" for name in covariates))))
     if "t" in plain:
         (t,) = _parse_columns(plain, ("t",))
@@ -246,20 +250,21 @@ class BlockMessages(Decoder):
     def __init__(self, prefix: str, assets: Mapping[str, SourceAsset]) -> None:
         if find_spec("simdjson") is None:
             raise ConfigError("pysimdjson is missing, pip install 'servoscope[mqtt]'")
-        self._prefix, self._covariates = prefix, {name: asset.covariates for name, asset in assets.items()}
+        self._prefix, self._assets = prefix, dict(assets)
 
     def addresses(self, *, everyone: bool = False) -> list[str]:
         """Return the topics of these assets: another service at this broker may follow others."""
-        return [data_topic(self._prefix, asset) for asset in sorted(self._covariates)]
+        return [data_topic(self._prefix, asset) for asset in sorted(self._assets)]
 
     def find_asset(self, address: str) -> str:
         """Return the asset of a topic; empty: none of ours."""
         asset = parse_asset(address)
-        return asset if asset in self._covariates else ""
+        return asset if asset in self._assets else ""
 
     def decode(self, message: InboxMessage) -> Content:
         """Return the block of one message."""
         asset = parse_asset(message.address)
-        if asset not in self._covariates:
+        if asset not in self._assets:
             raise MessageError("unknown asset", f"{asset[:100]!r} is none of the assets of this source")
-        return Content(blocks=(decode_block(asset, message.content, message.at, self._covariates[asset]),))
+        covariates, is_arm = self._assets[asset].covariates, self._assets[asset].is_arm
+        return Content(blocks=(decode_block(asset, message.content, message.at, covariates, is_arm=is_arm),))

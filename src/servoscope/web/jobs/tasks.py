@@ -17,6 +17,7 @@ import numpy as np
 
 from servoscope.assessment.assess import assess
 from servoscope.assessment.tags import find_loops
+from servoscope.baseline.arm import ArmBaseline
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.comparison import compare_baselines
 from servoscope.core.errors import RecordingError
@@ -34,6 +35,7 @@ from servoscope.models.loop import Columns, Loop
 from servoscope.report import plain_values
 from servoscope.service.renewal import read_stretch
 from servoscope.signals import Recording, readers
+from servoscope.signals.readers.arm_log import read_arm_log
 from servoscope.signals.readers.axes import find_axes, signal_names
 from servoscope.signals.readers.formats import open_file
 from servoscope.signals.readers.guess_columns import guess_mapping
@@ -144,6 +146,8 @@ def diagnose_file(
     """Diagnose a recording with a baseline, for users `name`; data and report go into the folder `out`."""
     from servoscope import report
 
+    if (of_arm := ArmBaseline.load(baseline_file)) is not None:
+        return _diagnose_arm(file, request, of_arm, name, Path(out))
     baseline = Baseline.load(baseline_file)
     baseline = baseline.at(request.point) if request.point is not None else baseline
     recording = read_recording(file, baseline.loop, request)
@@ -166,6 +170,26 @@ def diagnose_file(
     (Path(out) / "data.json").write_text(text, encoding="utf-8")
     kept = {"verdict": diagnosis.verdict, "summary": str(diagnosis.summary), "recording": diagnosis.recording}
     return {**kept, "hash": used.hash}
+
+
+def _diagnose_arm(
+    file: str, request: requests.DiagnosisRequest, baseline: ArmBaseline, name: str, out: Path
+) -> JsonObject:
+    from servoscope.diagnosis.arm import examine_arm
+    from servoscope.report.arm_page import write_arm_page
+
+    refused = [key for key in ("point", "where", "from_s", "to_s") if getattr(request, key) not in (None, {})]
+    if refused:
+        raise RecordingError(f"{', '.join(refused)}: not for an arm, leave out; its log is diagnosed as a whole")
+    recording = read_arm_log(file, baseline.loop, baseline.model.arm)
+    diagnosis, exam = examine_arm(baseline, recording)
+    write_arm_page(out / "report.html", diagnosis, exam, baseline)
+    document, arm = diagnosis.model_dump(mode="json"), exam.picture(baseline, diagnosis)
+    data = {"document": document, "words": {}, "units": ("", ""), "signals": None, "trace": None, "arm": arm}
+    text = json.dumps(plain_values.replace_nan(data), allow_nan=False)
+    (out / "data.json").write_text(text, encoding="utf-8")
+    kept = {"verdict": diagnosis.verdict, "summary": str(diagnosis.summary), "recording": diagnosis.recording}
+    return {**kept, "hash": baseline.hash}
 
 
 def learn_baseline(

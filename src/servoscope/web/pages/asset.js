@@ -1,6 +1,7 @@
 // One asset: the verdict in words, where its inverse response is now, both tests, parameters, signals, alarms; live.
 import { get, part, query } from "./api.js";
 import { history as steps } from "./alarms.js";
+import { drawnArm } from "./arm.js";
 import { bode } from "./bode.js";
 import { plot } from "./charts.js";
 import { commands, STATES } from "./commands.js";
@@ -44,6 +45,9 @@ export async function show(main, { session, signal, linked, values, part: name, 
   const compared = periods(path, () => asset, values, signal);
   const statistic = h("div", { class: "plot tall" });
   const samples = h("div", { class: "plot tall" });
+  const isArm = asset.about.plant === "arm";
+  const joints = h("div", {});
+  const arm = section("The arm and its joints", "Filled by the probability that the joint has changed.", joints);
   const spans = Object.entries(SPANS).map(([words, seconds]) => h("button", { type: "button", class: "filter", "aria-pressed": "false", onclick: () => chosen(seconds) }, words));
   const lengths = Object.entries(SIGNALS).map(([words, seconds]) => h("button", { type: "button", class: "filter", "aria-pressed": String(seconds === 30), onclick: () => looked(seconds) }, words));
   const baseline = asset.baseline && h("a", { href: `/design?baseline=${part(asset.baseline)}` }, "What this baseline can tell apart");
@@ -61,6 +65,7 @@ export async function show(main, { session, signal, linked, values, part: name, 
       happened.element,
       grown.element,
       half(titled("Signals", lengths, samples)),
+      arm,
       signed,
       compared.element,
       half(section("Stream", null, counted)),
@@ -76,6 +81,8 @@ export async function show(main, { session, signal, linked, values, part: name, 
     )),
   );
 
+  arm.hidden = true; // until there is a diagnosis
+  if (isArm) for (const element of [samples, plane.element, response]) element.closest("section").hidden = true; // of one loop
   // Live parts first: they need nothing but what is there already.
   plane.start(began(asset));
   let past24 = null;
@@ -118,8 +125,15 @@ export async function show(main, { session, signal, linked, values, part: name, 
     past.replaceChildren(steps(alarms.transitions, false));
     diagnoses.replaceChildren(list(found.diagnoses.slice(-LISTED)));
     const inFull = found.diagnoses.filter((one) => one.grounds === "full");
+    if (isArm && inFull.length) await draw(inFull.at(-1));
     await explain(inFull.at(-1), inFull.find((one) => one.t >= began(asset)));
     await Promise.all([grown.load(), happened.load(found.diagnoses)]);
+  }
+
+  async function draw(row) {
+    const { arm: drawing } = await get(`/diagnoses/${part(row.id)}`, signal);
+    if (drawing) joints.replaceChildren(drawnArm(drawing));
+    arm.hidden = !drawing;
   }
 
   // The motion by the last full diagnosis, beside that of the first one of this fault.
@@ -237,7 +251,8 @@ function topOf(session, path, signal) {
   const [element, status, tests] = [h("div", {}), h("p", { class: "note" }), h("p", { class: "note" })];
   let shown = "";
   const update = (asset) => {
-    tests.textContent = translate(`Statistic T², × limit: ${multiple(asset.statistic)}; sequential test, × limit: ${multiple(asset.level)}; alarm at 1.`);
+    const both = `Statistic T², × limit: ${multiple(asset.statistic)}; sequential test, × limit: ${multiple(asset.level)}; alarm at 1.`;
+    tests.textContent = translate(asset.about.plant === "arm" ? `Evidence of a change, × limit: ${multiple(asset.statistic)}; alarm at 1.` : both);
     status.replaceChildren(badge(asset.ne107, `NE 107: ${STATUS[asset.ne107]}${asset.reasons.length ? `, for ${asset.reasons.map(plain).join(", ")}` : ""}`), ` ${translate("Last sample")}: ${moment(asset.t)}`);
     const now = outline(asset.verdict, [...asset.sections, asset.checks]);
     if (element.querySelector("form :focus")) return false;

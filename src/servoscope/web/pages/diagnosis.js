@@ -1,5 +1,6 @@
 // One diagnosis at its permanent address: verdict, grounds, candidates, pictures, numbers; it prints on paper.
 import { get, part, query } from "./api.js";
+import { drawnArm } from "./arm.js";
 import { plot } from "./charts.js";
 import { coefficient, signals, signature, tests } from "./curves.js";
 import { details, evidence, experts, verdict } from "./document.js";
@@ -48,6 +49,7 @@ function picturesOf(found, said, picture, drawn, signal) {
   const units = found.units ?? {};
   const marks = said.onset_s ? [[said.onset_s[1], "onset"]] : [];
   const made = {};
+  if (found.arm) made.arm = () => drawnArm(found.arm);
   if (found.signals) made.signals = () => picture("Reference, output and input", (c) => signals(c, { ...found.signals, units, marks }), "plot tall");
   if (trace) made.statistic = () => picture("Both tests over time, as multiples of their limits", (c) => tests(c, { ...trace, marks, clock: false, range: [trace.t[0], trace.t.at(-1)] }));
   if (found.signature?.length) made.signature = () => picture("Mean input over position and speed", (c) => signature(c, { curves: found.signature, units }));

@@ -11,7 +11,7 @@ import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 from starlette.exceptions import HTTPException
 
-from servoscope.core.errors import LoopError, StoreError, StoreUnavailableError
+from servoscope.core.errors import BaselineError, LoopError, StoreError, StoreUnavailableError
 from servoscope.design.operating_limits import OperatingLimit, operating_limits
 from servoscope.prognosis.forecast import prognose
 from servoscope.service.asset_link import page_address, qr_code
@@ -25,7 +25,7 @@ from servoscope.web.asset_document import has_open_fault
 from servoscope.web.checks import asset_checks, asset_loop, fault_checks, last_full_diagnosis
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
 from servoscope.web.downsample import signal_columns
-from servoscope.web.routes.baselines import asset_baseline_id, find_baseline, load_cached
+from servoscope.web.routes.baselines import asset_baseline_id, find_baseline, load_cached, load_loop_baseline
 from servoscope.web.schemas import assets as schemas
 from servoscope.web.schemas import sizes
 from servoscope.web.schemas.checks import CheckRequest, FaultCheck
@@ -201,8 +201,8 @@ def get_limits(context: ContextDep, asset: str) -> sizes.LimitList:
 @functools.lru_cache(maxsize=256)  # it takes a second, and every reader of a page asks
 def _loop_limits(baseline: Path, _: str) -> tuple[OperatingLimit, ...]:
     try:
-        return tuple(operating_limits(load_cached(baseline).loop))
-    except LoopError:
+        return tuple(operating_limits(load_loop_baseline(baseline).loop))
+    except (BaselineError, LoopError):
         return ()
 
 

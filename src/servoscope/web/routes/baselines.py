@@ -17,6 +17,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 from starlette.status import HTTP_201_CREATED, HTTP_202_ACCEPTED, HTTP_204_NO_CONTENT
 
+from servoscope.baseline.arm import AnyBaseline, ArmBaseline, load_baseline
 from servoscope.baseline.baseline import Baseline
 from servoscope.models.loop import Loop
 from servoscope.report import plain_values
@@ -81,20 +82,30 @@ def _saved_baseline(context: Context, record: responses.BaselineRecord) -> Basel
     return BaselineFile(path, responses.BaselineRow(name=record.id, origin="saved", **dict(record)))
 
 
-def _baseline_facts(baseline: Baseline) -> responses.BaselineFacts:
-    sources = [source for one in baseline.per_point for source in one.sources]
+def _baseline_facts(baseline: AnyBaseline) -> responses.BaselineFacts:
+    if isinstance(baseline, ArmBaseline):
+        loop, points, units, sources = baseline.loop.carrier, tuple[str, ...](), None, list(baseline.sources)
+    else:
+        loop, points, units = baseline.loop, baseline.points, signal_units(baseline.loop.plant.units)
+        sources = [source for one in baseline.per_point for source in one.sources]
     return responses.BaselineFacts(
-        loop=baseline.loop.name,
+        loop=loop.name,
         hash=baseline.hash,
-        points=list(baseline.points),
-        columns=baseline.loop.columns.model_dump(mode="json"),
-        units=signal_units(baseline.loop.plant.units),
+        points=list(points),
+        columns=loop.columns.model_dump(mode="json"),
+        units=units,
         recordings=len(sources),
         duration_s=sum(source.duration_s for source in sources),
     )
 
 
-def load_cached(path: Path) -> Baseline:
+def load_loop_baseline(path: Path) -> Baseline:
+    """Return the baseline of a loop in a file; raises BaselineError if it is of an arm."""
+    baseline = load_cached(path)
+    return Baseline.load(path) if isinstance(baseline, ArmBaseline) else baseline
+
+
+def load_cached(path: Path) -> AnyBaseline:
     """Return the baseline in a file, which is read again when it has changed."""
     try:
         stamp = path.stat().st_mtime_ns
@@ -104,8 +115,8 @@ def load_cached(path: Path) -> Baseline:
 
 
 @lru_cache(maxsize=64)
-def _load_version(path: Path, _: int) -> Baseline:
-    return Baseline.load(path)
+def _load_version(path: Path, _: int) -> AnyBaseline:
+    return load_baseline(path)
 
 
 def resolve_loop(context: Context, ref: LoopRef) -> LoopRef:
@@ -132,8 +143,9 @@ def list_baselines(context: ContextDep) -> responses.BaselineList:
 def get_baseline(context: ContextDep, id: str) -> responses.BaselineDetail:
     """Return a baseline: what was learned, and which faults it can detect."""
     baseline_file = find_baseline(context, id)
-    summary: Any = plain_values.replace_nan(plain_values.baseline_summary(load_cached(baseline_file.path)))
-    return responses.BaselineDetail(**dict(baseline_file.row), summary=summary)
+    baseline = load_cached(baseline_file.path)
+    summary: Any = baseline.summary() if isinstance(baseline, ArmBaseline) else plain_values.baseline_summary(baseline)
+    return responses.BaselineDetail(**dict(baseline_file.row), summary=plain_values.replace_nan(summary))
 
 
 @router.get("/baselines/{id}/file", response_class=Response, responses=JSON_RESPONSES)
@@ -162,10 +174,8 @@ def list_loops(context: ContextDep) -> responses.LoopList:
     for name in EXAMPLES:
         text = files("servoscope.simulation").joinpath(f"{name}.toml").read_text(encoding="utf-8")
         rows.append(_loop_row({"example": name}, Loop.from_dict(tomllib.loads(text)), text))
-    rows += [
-        _loop_row({"baseline": baseline_file.row.id}, load_cached(baseline_file.path).loop, None)
-        for baseline_file in _list_files(context)
-    ]
+    loops = ((file.row.id, load_cached(file.path).loop) for file in _list_files(context))
+    rows += [_loop_row({"baseline": id_}, loop, None) for id_, loop in loops if isinstance(loop, Loop)]
     return responses.LoopList(loops=rows)
 
 

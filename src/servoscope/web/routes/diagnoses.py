@@ -31,7 +31,7 @@ from servoscope.web.schemas import responses
 from servoscope.web.schemas.assets import signal_units
 from servoscope.web.schemas.requests import DiagnosisQuery, DiagnosisRequest
 from servoscope.web.statuses import asset_statuses, read_statuses
-from servoscope.web.stored_diagnosis import read_diagnosis
+from servoscope.web.stored_diagnosis import STORED_BESIDE, read_diagnosis
 
 router = APIRouter(tags=["diagnoses"], dependencies=[VIEWER])
 
@@ -99,7 +99,8 @@ def _asset_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
         raise HTTPException(404, f"there is no diagnosis {id_}")
     document = dict(rows[0]["document"])
     diagnosis = read_diagnosis(document)
-    began, signature, _ = document.pop("began", None), document.pop("signature", []), document.pop("said", None)
+    beside = {key: document.pop(key, None) for key in STORED_BESIDE}
+    began = beside["began"]
     facts = next(
         (status.metadata for _, status in asset_statuses(read_statuses(context.store, [asset]).values())), None
     )
@@ -113,7 +114,8 @@ def _asset_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
     return responses.DiagnosisDetail(
         **dict(responses.DiagnosisRow.from_stored(rows[0])),
         began=began,
-        signature=signature,
+        signature=beside["signature"] or [],
+        arm=beside["arm"],
         document=document,
         sections=to_json(diagnosis_document(diagnosis, known)) if diagnosis is not None else [],
         baseline=baseline,
@@ -143,7 +145,8 @@ def _upload_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
     record = context.storage.read(responses.UploadDiagnosis, id_.removeprefix(UPLOAD_PREFIX))
     path = context.storage.path(responses.UploadDiagnosis, record.id) / "data.json"
     data = json.loads(path.read_bytes())
-    coefficients = {one["name"]: one["unit"] for one in data["trace"]["parameters"]}
+    trace = data["trace"]
+    coefficients = {one["name"]: one["unit"] for one in trace["parameters"]} if trace is not None else {}
     y, u = data["units"]
     known = DiagnosisContext(words=data["words"], units=(y, u), coefficient_units=coefficients)
     return responses.DiagnosisDetail(
@@ -154,7 +157,8 @@ def _upload_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
         baseline=record.baseline,
         units=signal_units(data["units"]),
         signals=data["signals"],
-        trace=data["trace"],
+        trace=trace,
+        arm=data.get("arm"),
         signature=data.get("signature", []),  # of earlier versions
         report=f"{API}/diagnoses/{id_}/report",
         upload=record.upload,

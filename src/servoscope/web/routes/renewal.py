@@ -9,6 +9,7 @@ from fastapi import APIRouter
 from starlette.exceptions import HTTPException
 from starlette.status import HTTP_202_ACCEPTED
 
+from servoscope.baseline.arm import ArmBaseline
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.history import history_folder
 from servoscope.service import renewal
@@ -17,7 +18,7 @@ from servoscope.service.config import ServiceFile
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Engineer
 from servoscope.web.jobs.queue import Job
 from servoscope.web.routes.assets import find_asset
-from servoscope.web.routes.baselines import load_cached
+from servoscope.web.routes.baselines import load_cached, load_loop_baseline
 from servoscope.web.schemas import responses
 from servoscope.web.schemas.requests import RelearningRequest, TakeRequest
 
@@ -32,7 +33,7 @@ def _find_config(context: Context, asset: str) -> tuple[ServiceFile, AssetStatus
 
 
 def _progress(context: Context, config: ServiceFile, asset: str, status: AssetStatus) -> responses.RelearningState:
-    baseline = load_cached(config.baseline_file(asset))
+    baseline = load_loop_baseline(config.baseline_file(asset))
     progress = renewal.learning_progress(config, context.store, asset, status, baseline)
     point = config.assets[asset].point
     offers = renewal.offers(baseline.at(point) if point else baseline, status, config.diagnosis.kept_s)
@@ -45,6 +46,8 @@ def get_progress(context: ContextDep, asset: str) -> responses.RelearningState |
     (_, status), config = find_asset(context, asset), context.config
     if config is None or asset not in config.assets:
         return None
+    if isinstance(load_cached(config.baseline_file(asset)), ArmBaseline):
+        return None  # what it learns from are whole logs of several days
     return _progress(context, config, asset, status)
 
 
@@ -55,7 +58,7 @@ async def start_preview(
     """Learn its baseline anew from the samples that the store keeps; a job. Nothing is put in force."""
     config, _ = await asyncio.to_thread(_find_config, context, asset)
     path, point = config.baseline_file(asset), config.assets[asset].point or ""
-    before = await asyncio.to_thread(load_cached, path)
+    before = await asyncio.to_thread(load_loop_baseline, path)
     stretch = await asyncio.to_thread(
         renewal.stored_stretch, config, context.store, asset, before, request.since, request.until
     )

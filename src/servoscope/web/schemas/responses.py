@@ -192,6 +192,7 @@ class DiagnosisDetail(DiagnosisRow):
     units: dict[str, str] | None
     signals: JsonObject | None = None
     trace: JsonObject | None = None
+    arm: JsonObject | None = None  # how it is drawn
     signature: list[JsonObject] = []
     report: str | None = None
     upload: str | None = None

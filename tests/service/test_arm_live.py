@@ -1,0 +1,123 @@
+"""An arm as an asset of the service: messages of all joints to verdict, alarm, sizes and status."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from arm_halls import FRICTION, ONSET_S, SIZE, arm_hall, replayed_arm, write_arm
+from brokers import BEGAN, Running, Sender, started_broker, until
+from halls import asked, service_of
+
+from servoscope.baseline.arm import ArmBaseline
+from servoscope.core.errors import ConfigError
+from servoscope.service.build import build_assets, check_service_file
+from servoscope.service.config import ServiceFile
+from servoscope.simulation.arm import simulated_arm_loop
+
+pytestmark = pytest.mark.slow  # minutes of six joints are simulated and diagnosed
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_arm(tmp_path_factory.mktemp("hall"))
+
+
+def messages(folder: Path) -> list[bytes]:
+    """The log as messages of a second each, all joints in each of them; one joint is missing for a moment."""
+    loop, table = simulated_arm_loop(), np.genfromtxt(folder / "run.csv", delimiter=",", names=True)
+    found = []
+    for number, first in enumerate(range(0, table.size, 100)):
+        rows = table[first : first + 100]
+        columns: dict[str, Any] = {name: rows[column].tolist() for name, column in loop.channels.items()}
+        if number == 10:
+            columns["elbow.torque"][40:50] = [None] * 10
+        content = {"version": 1, "sequence": number, "t0": BEGAN + rows["t"][0], "dt": 0.01, "covariates": columns}
+        found.append(json.dumps(content).encode())
+    return found
+
+
+def is_diagnosed(config: Path, blocks: int) -> bool:
+    """Whether so many blocks are counted, and all of their diagnoses made."""
+    rows = asked(config, "SELECT status FROM checkpoints WHERE asset = 'cell'")
+    status = json.loads(rows[0][0]) if rows else {"awaited": [0]}
+    return not status["awaited"] and status["counted"]["blocks"] == blocks
+
+
+def test_messages_of_all_joints_name_the_joint_and_raise_the_alarm(folder: Path, tmp_path: Path) -> None:
+    broker = started_broker(tmp_path)
+    config = arm_hall(folder, "broker", f'kind = "mqtt"\nhost = "127.0.0.1"\nport = {broker.port}')
+    service = service_of(config)
+    running = Running(service)
+    try:
+        until(lambda: service.sources["line"].connected)
+        sender = Sender(broker.port)
+        for number, message in enumerate(messages(folder), 1):
+            sender.send(message, asset="cell")
+            if number % 10 == 0:  # as in real time, its diagnoses are made while it works
+                until(lambda count=number: is_diagnosed(config, count))
+    finally:
+        running.end(stop=True)
+        broker.stop()
+    found = asked(config, "SELECT verdict, t, summary, onset, document FROM diagnoses ORDER BY t")
+    assert [row[0] for row in found][:1] == ["healthy"]
+    _, _, summary, onset, document = next(row for row in found if row[0] == "fault")
+    assert summary.startswith("Fault: friction of elbow.") and " since 2026-01-01 00:00:4" in summary
+    assert onset == pytest.approx(BEGAN + ONSET_S, abs=2.0)
+    (fault,) = json.loads(document)["faults"]
+    assert fault["name"] == FRICTION and fault["interval"][0] < SIZE < fault["interval"][1]
+    sizes = asked(config, f"SELECT value FROM sizes WHERE name = '{FRICTION}'")
+    assert sizes and all(value == pytest.approx(SIZE, abs=0.2) for (value,) in sizes)
+    coefficients = {name for (name,) in asked(config, "SELECT name FROM sizes WHERE kind = 'coefficient'")}
+    assert "elbow.coulomb_friction" in coefficients
+    assert asked(config, "SELECT count(*) FROM residuals")[0][0] >= 3
+    raised = asked(config, "SELECT t FROM transitions WHERE alarm = 'fault' AND after = 'unacknowledged'")
+    assert raised and raised[0][0] > BEGAN + ONSET_S
+    status = json.loads(asked(config, "SELECT status FROM checkpoints WHERE asset = 'cell'")[0][0])
+    assert status["verdict"] == "fault" and status["about"]["plant"] == "arm" and status["statistic"] > 1.0
+    assert "gap" not in status["quality"] and status["counted"]["samples"] == 9000
+
+
+def test_a_killed_service_asks_for_the_diagnosis_again(folder: Path) -> None:
+    config = replayed_arm(folder, "killed")
+    asset = build_assets(ServiceFile.load(config))["cell"]
+    service_of(config).run()
+    first = asked(config, "SELECT verdict, t, summary FROM diagnoses ORDER BY t")
+    assert first and first[-1][0] == "fault"
+    again = service_of(config)
+    state = again.assets["cell"].state
+    assert (
+        state is not None and state.examination.faults[0]["name"] == FRICTION and state.baseline == asset.baseline.hash
+    )
+    again.run()
+    assert asked(config, "SELECT verdict, t, summary FROM diagnoses ORDER BY t") == first
+
+
+def test_what_an_arm_cannot_be_is_refused_in_one_line(folder: Path) -> None:
+    replay = 'kind = "replay"\nspeed = 0.0'
+    rows = 'kind = "mqtt"\nhost = "127.0.0.1"\n[sources.line.payload]\ntopics = ["plant/{asset}"]\ntime = { t = "s" }'
+    for source, more, why in (
+        (replay, 'files = ["run.csv"]\npoint = "cold"', "an arm has no operating points, leave it out"),
+        (
+            replay,
+            f'files = ["run.csv"]\nlimits = {{ "{FRICTION}" = "tracking" }}',
+            "not known of an arm, give a number",
+        ),
+        (replay, 'files = ["run.csv"]\nlimits = { leakage = 1.5 }', "there is no fault of cell 'leakage'"),
+        (rows, "", "depends on base_yaw.position, base_yaw.torque"),
+    ):
+        with pytest.raises(ConfigError, match=why):
+            check_service_file(ServiceFile.load(arm_hall(folder, "refused", source, more)))
+    assert (
+        check_service_file(
+            ServiceFile.load(
+                arm_hall(folder, "taken", replay, f'files = ["run.csv"]\nlimits = {{ "{FRICTION}" = 1.5 }}')
+            )
+        )
+        == []
+    )
+    baseline = ArmBaseline.load(folder / "arm.json")
+    assert baseline is not None and FRICTION in baseline.fault_names
