@@ -200,6 +200,7 @@ def ur10e(folder: Path) -> tuple[list[Table], dict[str, str]]:
         total = len(INJECTED) * len(arm.names)
         counts = of(found, total), of(right, total), of(inside, right), *(of(x, total) for x in simple_right)
         rows.append((f"Coulomb friction + {100.0 * growth:.0f} %", *counts))
+        values[f"ur10e.named{100.0 * growth:.0f}"] = of(right, total)
     values |= {f"ur10e.{100.0 * growth:.0f}": ", ".join(map(str, counts)) for growth, counts in best.items()}
     masses = []
     for calibrating, judged in (LOADED, LOADED[::-1]):

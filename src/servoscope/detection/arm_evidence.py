@@ -17,7 +17,7 @@ from servoscope.baseline.arm import ArmCause
 from servoscope.core.arrays import FloatArray
 from servoscope.estimation.arm_regression import Information
 
-MIN_END_BLOCKS = 3  # blocks of a recording that a change has to last
+MIN_END_BLOCKS = 1  # blocks of a recording that a change has to last
 INTERVAL = 1.96  # standard deviations, on both sides
 EM_STEPS = 25  # of expectation and maximisation, after which the variances have settled
 SIMULATED_RECORDINGS = 1000  # healthy ones, from which the limit comes

@@ -244,14 +244,13 @@ def _explain(
         groups[cause_evidence.cause.kind, cause_evidence.cause.joint].append(index)
     odds = {key: float(evidence.probability[indices].sum()) for key, indices in groups.items()}
     ranked = sorted(odds, key=lambda key: -odds[key])
-    best = evidence.causes[groups[ranked[0]][0]]
+    best = _pool(evidence, groups[ranked[0]])
     onset, from_start = _onset(baseline, evidence, best, rows)
     since = message("diagnosis.since_start") if from_start else message("diagnosis.since", t=onset[1], growth=None)
     candidates = []
     for key in ranked:
         if odds[key] >= MIN_PROBABILITY:
-            likeliest = evidence.causes[groups[key][0]]
-            fault = _fault(baseline, likeliest)
+            fault = _fault(baseline, likeliest := _pool(evidence, groups[key]))
             faults = () if fault is None else (fault,)
             candidates.append(Candidate(name=likeliest.cause.name, probability=odds[key], faults=faults))
     certain = odds[ranked[0]] >= MIN_CERTAINTY and best.cause.kind != UNKNOWN
@@ -281,6 +280,19 @@ def _explain(
         "arm.would_tell_joints" if len(joints) > 1 else "arm.would_tell", joints=joints or [message("arm.last_link")]
     )
     return "fault", message("arm.ambiguous", rivals=rivals, since=since, told=told), interval, reasons
+
+
+def _pool(evidence: ChangeEvidence, indices: Sequence[int]) -> CauseEvidence:
+    """Return the likeliest of causes of one kind, its first size averaged over those that have it by probability."""
+    likeliest = evidence.causes[indices[0]]
+    same = [index for index in indices if evidence.causes[index].cause.parameter == likeliest.cause.parameter]
+    share = evidence.probability[same] / evidence.probability[same].sum()
+    sizes = np.array([evidence.causes[index].size[0] for index in same])
+    variances = np.array([evidence.causes[index].covariance[0, 0] for index in same])
+    size, covariance = likeliest.size.copy(), likeliest.covariance.copy()
+    size[0] = share @ sizes
+    covariance[0, 0] = share @ (variances + (sizes - size[0]) ** 2)
+    return likeliest._replace(size=size, covariance=covariance)
 
 
 def _joint(name: str) -> Message | None:
@@ -316,7 +328,7 @@ def _onset_interval(t: FloatArray, onset: FloatArray) -> tuple[tuple[float, floa
     ends = np.searchsorted(below, [ONSET_TAIL, 1.0 - ONSET_TAIL])
     low, high = (min(int(end), below.size - 1) for end in ends)
     # a change within a block: either this or the next is the first that is better explained with it
-    first, last = t[max(0, low - 1)], t[min(high + 1, below.size - 1)]
+    first, last = t[max(0, low - 1)], t[min(high + 1, t.size - 1)]
     return (float(first), float(t[int(onset.argmax())]), float(last)), low == 0
 
 
