@@ -10,14 +10,16 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from scipy.ndimage import uniform_filter1d
 from typer.testing import CliRunner
 
 from servoscope.baseline.arm import ArmBaseline
 from servoscope.baseline.baseline import Baseline
 from servoscope.cli import app
-from servoscope.core.errors import BaselineError, NotEnoughError, RecordingError
+from servoscope.core.errors import BaselineError, LoopError, NotEnoughError, RecordingError
 from servoscope.core.messages import set_language
 from servoscope.diagnosis.arm import diagnose_arm, examine_arm
+from servoscope.estimation.arm_regression import filter_arm_log
 from servoscope.learning.arm import learn_arm
 from servoscope.learning.arm_setup import calibrate_load
 from servoscope.models.arm.settings import ArmLoop
@@ -99,6 +101,45 @@ def test_a_push_is_an_event(simulated: tuple[ArmBaseline, Read]) -> None:
     assert diagnosis.verdict == "healthy" and "push or collision" in diagnosis.summary
     (event,) = [each for each in diagnosis.warnings if each.kind == "event"]
     assert event.from_s == pytest.approx(15.0, abs=0.5) and "shoulder" in event.message
+    target = recording.q + 0.1 * (recording.t > 15.2)[:, None]
+    jumped = diagnose_arm(baseline, replace(recording, torque=torque, target=target))
+    assert [each.message[:30] for each in jumped.warnings if each.kind == "event"] == ["a jump of the target position:"]
+
+
+def test_closed_brakes_are_no_event(simulated: tuple[ArmBaseline, Read]) -> None:
+    """The arm pauses for 5 s, in which brakes hold it for 3 s and the drives give no torque."""
+    baseline, record = simulated
+    recording = record(23, None)
+    speed = np.interp(recording.t, [10.0, 10.5, 15.5, 16.0], [1.0, 0.0, 0.0, 1.0])
+    passed = np.cumsum(speed) / recording.sample_rate
+    q = np.column_stack([np.interp(passed, recording.t, own) for own in recording.q.T])
+    signals = filter_arm_log(replace(recording, q=q), baseline.model)
+    expected = np.einsum("jpm,p->jm", baseline.design(signals), np.array(baseline.theta))
+    torque = np.column_stack([np.interp(recording.t, signals.t, own) for own in expected])
+    assert np.abs(torque[1300]).max() > 5.0  # N m of weight
+    torque[1150:1450] = 0.0
+    diagnosis = diagnose_arm(baseline, replace(recording, q=q, torque=torque))
+    assert diagnosis.verdict == "healthy" and [each.kind for each in diagnosis.warnings] == []
+
+
+def test_a_logged_velocity_is_used_where_it_is_the_better_one(simulated: tuple[ArmBaseline, Read]) -> None:
+    baseline, record = simulated
+    recording = record(23, None)
+    v = np.gradient(recording.q, 0.01, axis=0)
+    joints = {name: {**joint.model_dump(), "velocity": f"v{name}"} for name, joint in baseline.loop.joints.items()}
+    loop = ArmLoop.from_dict(baseline.loop.model_dump() | {"joints": joints}, "arm.toml")
+    for velocity, words in (
+        (uniform_filter1d(v, 5, axis=0), "velocities are used"),
+        (v + 1e-2 * np.sin(v * 1e4), "left out"),
+    ):
+        learned = learn_arm(loop, baseline.urdf, [replace(recording, velocity=velocity)])
+        assert words in str(learned.notes[0])
+        assert (learned.loop.joints["elbow"].velocity is None) == (words == "left out")
+    with pytest.raises(RecordingError, match=r"is 57\.3 times the derivative of its position"):
+        learn_arm(loop, baseline.urdf, [replace(recording, velocity=np.degrees(v))])
+    del joints["elbow"]["velocity"]
+    with pytest.raises(LoopError, match="velocity must be given of all joints, or of none"):
+        ArmLoop.from_dict(baseline.loop.model_dump() | {"joints": joints}, "arm.toml")
 
 
 def test_an_arm_at_rest_is_undetermined(simulated: tuple[ArmBaseline, Read]) -> None:

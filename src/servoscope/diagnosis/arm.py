@@ -14,7 +14,7 @@ from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import RecordingError
 from servoscope.core.messages import Message, message
-from servoscope.detection.arm_events import ArmEvent, find_events, outside_events, outside_torque
+from servoscope.detection.arm_events import ArmEvent, find_events, outside_events, outside_torque, target_jumps
 from servoscope.detection.arm_evidence import INTERVAL, MIN_END_BLOCKS, CauseEvidence, ChangeEvidence, ChangeTest
 from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, FaultInterval, FinalCoefficient, Verdict
 from servoscope.estimation.arm_regression import (
@@ -109,7 +109,7 @@ def examine_arm(baseline: ArmBaseline, recording: ArmRecording) -> tuple[Diagnos
     signals = filter_arm_log(recording, model)
     design, theta = baseline.design(signals), np.array(baseline.theta)
     residual = signals.tau - np.einsum("jpm,p->jm", design, theta)
-    outside = outside_torque(signals, design, residual, model, theta)
+    outside = outside_torque(signals, design, residual, noise, model, theta)
     events = find_events(signals.t, outside, np.array(baseline.event_limits) * noise, model.arm.names)
     columns = np.concatenate([design, baseline.deviations(signals, design)], axis=1)
     moved, rows, information, evidence = _weigh(baseline, signals, columns, residual, events)
@@ -117,7 +117,7 @@ def examine_arm(baseline: ArmBaseline, recording: ArmRecording) -> tuple[Diagnos
         # what differs without them is a change, of which they are the peaks
         events = []
         moved, rows, information, evidence = _weigh(baseline, signals, columns, residual, events)
-    warnings = [*_event_warnings(events), *_still_warnings(model.arm.names, moved, recording)]
+    warnings = [*_event_warnings(events, recording), *_still_warnings(model.arm.names, moved, recording)]
     if evidence is None or information is None:
         headline = message("arm.undetermined_pushed" if events else "arm.undetermined")
         return _result(recording, "undetermined", headline, warnings), ArmExamination(signals, outside, None, events)
@@ -182,9 +182,10 @@ def _warning(kind: str, from_s: float, to_s: float, text: Message) -> DiagnosisW
     return DiagnosisWarning(kind=kind, from_s=float(from_s), to_s=float(to_s), count=1, description=text)
 
 
-def _event_warnings(events: Sequence[ArmEvent]) -> Iterator[DiagnosisWarning]:
-    for event in events:
-        text = message("arm.event", joints=event.joints, torque=event.torque, joint=event.joints[0])
+def _event_warnings(events: Sequence[ArmEvent], recording: ArmRecording) -> Iterator[DiagnosisWarning]:
+    for event, jump in zip(events, target_jumps(recording.t, recording.target, events), strict=True):
+        kind = "arm.event_trajectory" if jump else "arm.event"
+        text = message(kind, joints=event.joints, torque=event.torque, joint=event.joints[0])
         yield _warning("event", event.from_s, event.to_s, text)
 
 

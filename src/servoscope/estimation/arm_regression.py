@@ -83,6 +83,8 @@ def _filter_pieces(recording: ArmRecording, model: ArmModel) -> Iterator[ArmSign
                 continue
             q = sosfiltfilt(of_motion, recording.q[rows], axis=0)
             v = np.gradient(q, 1.0 / rate, axis=0)
+            if recording.velocity is not None:
+                v = sosfiltfilt(of_motion, recording.velocity[rows], axis=0)
             a = np.gradient(v, 1.0 / rate, axis=0)
             columns, mass = model.columns(q, v, a)
             moving = np.abs(v) > loop.rest_speed

@@ -95,11 +95,11 @@ def _message_fields(message: Any, prefix: str = "", depth: int = 0) -> Iterator[
         if isinstance(value, bool | int | float):
             yield f"{prefix}{name}", float(value)
         elif isinstance(value, list | tuple | np.ndarray) and len(value) <= MAX_ARRAY_LENGTH:
-            labelled = isinstance(labels, list) and len(labels) == len(value)
+            own = labels if isinstance(labels, list) and len(labels) == len(value) else ()
             for index, each in enumerate(value):
                 if isinstance(each, bool | int | float | np.number):
-                    if labelled:
-                        yield f"{prefix}{name}[{labels[index]}]", float(each)
+                    if own:
+                        yield f"{prefix}{name}[{own[index]}]", float(each)
                     yield f"{prefix}{name}[{index}]", float(each)
                 elif depth < 4:
                     yield from _message_fields(each, f"{prefix}{name}[{index}].", depth + 1)
