@@ -18,6 +18,7 @@ from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import OutputError
 from servoscope.core.files import atomic_write
 from servoscope.export.c_monitor import NAME, CMonitor, export_c, fill_template
+from servoscope.export.constants import refuse_covariates
 
 __all__ = ["export_fmu"]
 
@@ -56,6 +57,7 @@ def export_fmu(baseline: Baseline, path: str | Path, name: str = NAME, *, only_c
     OutputError
         If the compiler refuses the sources, or the file cannot be written.
     """
+    refuse_covariates(baseline, "co-simulation unit")
     made = export_c(baseline, name, only_coefficients=only_coefficients)
     source = fill_template("fmi3.c", {"prefix": name, "upper": name.upper(), "token": _token(made)})
     sources = {each: made.files[each] for each in (f"{name}.c", f"{name}.h")} | {"fmi3.c": source}

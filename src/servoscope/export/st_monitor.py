@@ -14,7 +14,7 @@ from servoscope.core.files import atomic_write, make_folder
 from servoscope.core.jit.st_source import st_literal
 from servoscope.estimation.kernel.sample_steps import HEADER_SIZE
 from servoscope.export.c_monitor import NAME, fill_template, wrapped
-from servoscope.export.constants import ExportConstants, check_name, common_words, plain_text
+from servoscope.export.constants import ExportConstants, check_name, common_words, plain_text, refuse_covariates
 from servoscope.export.steps import StepTexts
 from servoscope.export.steps_st import step_texts, temporaries
 
@@ -40,6 +40,7 @@ def export_st(baseline: Baseline, name: str = NAME, *, only_coefficients: bool =
     BaselineError
         If the baseline has something that cannot be exported; the message names it.
     """
+    refuse_covariates(baseline, "function block")
     check_name(name)
     made = ExportConstants.from_baseline(baseline, only_coefficients)
     return fill_template("monitor.st", common_words(made, name) | _words(made))

@@ -324,6 +324,12 @@ def translate(words: str, language: str | None = None) -> str:
             return known[f"word.{spelling}"]
     if " + " in words:  # a pair of faults
         return " + ".join(translate(each, language) for each in words.split(" + "))
+    kind, of, joint = words.partition(" of ")
+    if of and f"word.{kind}" in known:  # of a joint of an arm
+        return render(message("quantity.of_joint", kind=kind, joint=joint), language)
+    joint, dot, parameter = words.partition(".")
+    if dot and f"word.{parameter}" in known:
+        return f"{joint}: {known[f'word.{parameter}']}"
     what, bracket, unit = words.partition(" [")
     return known.get(f"word.{what}", what) + bracket + unit
 

@@ -18,8 +18,7 @@ from servoscope.models.arm.dynamics import STANDARD_GRAVITY
 from servoscope.models.arm.urdf import Kinematics, parse_urdf
 from servoscope.models.loop import Loop
 
-# of a joint, each with a key of its table
-SIGNALS = ("position", "torque", "temperature", "velocity", "target", "target_torque")
+OF_ALL_JOINTS = ("velocity", "target", "target_torque")  # columns that all joints have, or none
 DEFAULT_CUTOFF = 5.0  # Hz; the motion of an arm lies below, the ripple of its gears above
 
 
@@ -77,7 +76,7 @@ class ArmLoop(Settings):
         if self.cutoff >= self.sample_rate / 5.0:
             raise ValueError(f"cutoff: {self.cutoff:g} Hz is not below a fifth of sample_rate, lower it")
         n = len(self.joints)
-        for key in SIGNALS[3:]:
+        for key in OF_ALL_JOINTS:
             if 0 < [getattr(joint, key) for joint in self.joints.values()].count(None) < n:
                 raise ValueError(f"joints: {key} must be given of all joints, or of none")
         if self.gears is not None:
@@ -135,8 +134,8 @@ class ArmLoop(Settings):
     @property
     def channels(self) -> dict[str, str]:
         """The columns of all signals, by ``JOINT.position``, ``JOINT.torque`` and so on, and ``tool``."""
-        joints = ((f"{name}.{key}", getattr(joint, key)) for name, joint in self.joints.items() for key in SIGNALS)
-        return {name: column for name, column in (*joints, ("tool", self.tool)) if column is not None}
+        tables = ((f"{name}.{key}", value) for name, joint in self.joints.items() for key, value in joint)
+        return {name: column for name, column in (*tables, ("tool", self.tool)) if isinstance(column, str)}
 
     @property
     def carrier(self) -> Loop:
@@ -150,7 +149,7 @@ class ArmLoop(Settings):
     def of_channels(self) -> Self:
         """Return it for columns that are called as `channels` says, and time in seconds in a column ``t``."""
         joints = {
-            name: joint.model_copy(update={key: f"{name}.{key}" for key in SIGNALS if getattr(joint, key) is not None})
+            name: joint.model_copy(update={key: f"{name}.{key}" for key, value in joint if isinstance(value, str)})
             for name, joint in self.joints.items()
         }
         tool = None if self.tool is None else "tool"

@@ -160,7 +160,11 @@ def list_notes(context: ContextDep, asset: str) -> sizes.NoteList:
 @router.post("/assets/{asset}/notes", status_code=201)
 def add_note(context: ContextDep, who: Operator, asset: str, request: NoteRequest) -> sizes.Note:
     """Note what was done to it."""
-    find_asset(context, asset)
+    _, status = find_asset(context, asset)
+    if request.kind != NOTE and status.metadata.plant == "arm":
+        raise HTTPException(
+            409, f"{asset}: an arm learns from logs, and not from what the store keeps: use servoscope learn"
+        )
     context.store.add_audit(who.user, asset, NOTE, request.model_dump())
     return sizes.Note(who=who.user, **request.model_dump())
 
