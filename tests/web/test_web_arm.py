@@ -35,6 +35,7 @@ def test_an_arm_and_its_log(chromium: Any, tmp_path: Path) -> None:
         assert (size["name"], size["parameter"]) == (FRICTION, "elbow.coulomb_friction")
         moved = {one["name"]: (one["value"] - one["nominal"]) / one["std"] for one in asset["parameters"]}
         assert max(moved, key=lambda name: abs(moved[name])) == "elbow.coulomb_friction"
+        assert [one["unit"] for one in asset["parameters"]][:3] == ["N m", "N m s", "N m"]
         assert [check["fault"] for check in asset["checks"]] == [FRICTION]
         assert asset["checks"][0]["texts"] == ["Lubrication, bearings, seals and brake of the joint; its temperature"]
         assert asked(base, "/assets/cell/relearning") is None and asked(base, "/assets/cell/limits") == {"limits": []}

@@ -349,7 +349,7 @@ class Baseline(ShortRepr, BaselineMemory):
             ) from None
         if isinstance(content, Mapping) and content.get("format") == ARM_FORMAT:
             raise BaselineError(
-                f"{path}: baseline of an arm, which diagnose, services and fleets take, and no other command"
+                f"{path}: baseline of an arm, whose torques depend on all joints: diagnose, services and fleets take it"
             )
         if not isinstance(content, Mapping) or content.get("format") != FORMAT:
             raise BaselineError(f"{path}: is not a baseline; give the file that servoscope learn wrote")

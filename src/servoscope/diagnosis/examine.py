@@ -60,7 +60,7 @@ class Examination:
     statistic: FloatArray  # T^2, shape (K,)
     skipped_share: float  # share of the updates that the estimator's guard skipped
     noise_growth: float  # of the noise's variance against the baseline's
-    change: AxisChange | None = None  # within the recording, where it is one of a motor axis
+    apparent_change: AxisChange | None = None  # within the recording, where it is one of a motor axis
     along: CovariatePath | None = None  # what covariates make of the coefficients; None where none were learned
     replaced: bool = False  # whether the instrument of the nominal loop failed and the AKF took over
     quick: bool = False  # whether features are left out: of assets that are monitored, the monitor follows them
@@ -71,7 +71,6 @@ class Examination:
 
         `quick`: whether features and residual are left out, and the sequential test may be held against the baseline's
         own limits where neither these nor those for the recording's reference, which take far longer, raise an alarm.
-
         Raises RecordingError if the recording's sample rate is not the loop's.
         """
         loop = baseline.loop
@@ -82,8 +81,7 @@ class Examination:
             )
         along, pipeline = None, baseline.pipeline()
         if (model := baseline.covariates) is not None:
-            memory = pipeline.memory_samples
-            theta = np.array(baseline.theta)
+            memory, theta = pipeline.memory_samples, np.array(baseline.theta)
             if model.warm_up is None:
                 along = CovariatePath.of(model, theta, recording.channels, memory)
             else:
@@ -97,8 +95,7 @@ class Examination:
             baseline = baseline.model_copy(update=followed)
         exam = _run_quickly(baseline, recording) if quick and along is None else None
         exam = exam or _run_recursion(baseline, recording, pipeline, along)
-        skipped = exam.estimates.skipped_share
-        replaced = _has_failed_instrument(exam)
+        skipped, replaced = exam.estimates.skipped_share, _has_failed_instrument(exam)
         if replaced or skipped > MAX_SKIPPED_SHARE:
             other = loop.model_copy(update={"monitor": loop.monitor.model_copy(update=FALL_BACK)})
             pipeline = Pipeline.of(other, baseline.recursion.stage_one, baseline.recursion.still_speed)
@@ -111,7 +108,7 @@ class Examination:
             from servoscope.isolation.ml.axis_scan import find_axis_change
 
             change = find_axis_change(baseline, recording)
-        return replace(exam, skipped_share=skipped, replaced=replaced, change=change, quick=quick)
+        return replace(exam, skipped_share=skipped, replaced=replaced, apparent_change=change, quick=quick)
 
     @cached_property
     def drifts(self) -> bool:
@@ -176,12 +173,20 @@ class Examination:
     @cached_property
     def apparent_alarm(self) -> npt.NDArray[np.bool_]:
         """Whether a statistic of the coefficients was above its limit, after the delays, shape (K,)."""
-        return self._changed | apply_alarm_delays(any_exceeded(self.statistics[:2]), *self.pipeline.delays)
+        changed = self._changed(self.apparent_change)
+        return changed | apply_alarm_delays(any_exceeded(self.statistics[:2]), *self.pipeline.delays)
 
-    @property
-    def _changed(self) -> npt.NDArray[np.bool_]:
-        """Whether a change within the recording had been detected, or was not yet repaired, shape (K,)."""
-        change, index = self.change, self.estimates.index
+    @cached_property
+    def change(self) -> AxisChange | None:
+        """The change within the recording; None where a motion never seen may explain it: its limit knows none."""
+        if (change := self.apparent_change) is None:
+            return None
+        at = min(int(np.searchsorted(self.estimates.index, change.detected)), self.evaluations - 1)
+        return None if (self.motion_excess(slice(at, at + 1)) >= UNSEEN_EXCESS).any() else change
+
+    def _changed(self, change: AxisChange | None) -> npt.NDArray[np.bool_]:
+        """Return whether a change within the recording had been detected, or was not yet repaired, shape (K,)."""
+        index = self.estimates.index
         if change is None:  # what is left of u speaks of the whole recording
             return np.asarray((index == index[-1:].sum()) & (self.residual_ratios > 1.0).any())
         if change.repaired:
@@ -202,7 +207,7 @@ class Examination:
             exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & (self.motion_excess(at) < UNSEEN_EXCESS))
         exceeded &= any_exceeded(self.statistics[:2])
         self.release()
-        return self._changed | apply_alarm_delays(exceeded, *self.pipeline.delays)
+        return self._changed(self.change) | apply_alarm_delays(exceeded, *self.pipeline.delays)
 
     @cached_property
     def motion(self) -> RecordedMotion | None:
@@ -294,8 +299,7 @@ def _settling(pipeline: Pipeline, plant: Plant) -> int:
 
 def _reference_piece(recording: Recording, rows: slice, first: int) -> ReferencePath:
     """Return the reference of a chunk; the run began at sample `first`."""
-    before = rows.start - 1
-    ahead = (float(recording.t[before]), float(recording.r[before])) if rows.start > first else None
+    ahead = (float(recording.t[rows.start - 1]), float(recording.r[rows.start - 1])) if rows.start > first else None
     return reference_path(recording.rows(rows), ahead)
 
 
@@ -319,9 +323,8 @@ def _run_recursion(
 
     `run`: with the baseline's own sequential test; None: with limits for the recording's reference.
     """
-    tuning, noise, walk, watch = baseline.tuning, None, None, None
-    if baseline.healthy.noise is not None:
-        noise = baseline.healthy.noise.times(np.sqrt(growth))
+    tuning, noise, walk, watch = baseline.tuning, baseline.healthy.noise, None, None
+    noise = None if noise is None else noise.times(np.sqrt(growth))
     if run is not None:
         walk = None if run.mean is None else run.mean.again()
     elif noise is None:
@@ -335,9 +338,8 @@ def _run_recursion(
     def healthy(rows: slice) -> FloatArray:
         if walk is None:
             return tuning.theta
-        return np.asarray(
-            walk.advance(_reference_piece(recording, rows, 0)) + (tuning.theta - np.array(baseline.healthy.theta))
-        )
+        piece = _reference_piece(recording, rows, 0)
+        return np.asarray(walk.advance(piece) + (tuning.theta - np.array(baseline.healthy.theta)))
 
     started = tuning if along is None else replace(tuning, theta=along.start)
     estimating = EstimationRunner(pipeline, started, watch) if run is None else run.estimates.again()
@@ -363,10 +365,9 @@ def _run_recursion(
             outofcore.release(*recording.columns)
         if kept is not None:
             kept.result()
-    found = {name: column.to_array() for name, column in columns.items()}
-    expected, T2 = found.pop("expected"), found.pop("statistic")
-    estimates = Estimates(**found)
-    return Examination(baseline, recording, pipeline, tuning, estimates, noise, expected, T2, 0.0, growth)
+    arrays = {name: column.to_array() for name, column in columns.items()}
+    expected, T2 = arrays.pop("expected"), arrays.pop("statistic")
+    return Examination(baseline, recording, pipeline, tuning, Estimates(**arrays), noise, expected, T2, 0.0, growth)
 
 
 def _noise_growth(pipeline: Pipeline, estimates: Estimates) -> float:
@@ -395,6 +396,5 @@ def _has_failed_instrument(exam: Examination) -> bool:
         g = runner.advance(part.r, part.u, part.y, part.restart)
         z, phi = g.z[g.ok] / scale, g.phi[g.ok] / scale
         own, shared = own + z.T @ z, shared + z.T @ phi
-    if not own.any():
-        return False
-    return bool(np.linalg.eigvals(np.linalg.lstsq(own, shared, rcond=None)[0]).real.min() < MIN_INSTRUMENT_EIGENVALUE)
+    moved = np.linalg.lstsq(own, shared, rcond=None)[0]
+    return bool(own.any() and np.linalg.eigvals(moved).real.min() < MIN_INSTRUMENT_EIGENVALUE)

@@ -98,7 +98,7 @@ def export_c(
         "rounding": describe_rounding(made, only_coefficients, golden) if single else "",
     }
     named = {"monitor.c": f"{name}.c", "monitor.h": f"{name}.h", "check.c": "check.c", "Makefile": "Makefile"}
-    texts = {each: fill_template(template, values) for template, each in named.items()}
+    texts = {file: fill_template(template, values) for template, file in named.items()}
     image = pack_image(made.mark, golden.state, *golden.alarm)
     texts[f"{name}_golden.h"] = golden_text(golden, name, image)
     return CMonitor(texts, made.mark, values["state_bytes"], values["constant_bytes"], SIGNAL_BYTES)
@@ -157,7 +157,7 @@ def _code(made: ExportConstants, name: str, single: bool) -> dict[str, str]:
     healthy = [(c_literal(H.real, single), c_literal(H.imag, single)) for H in made.healthy.H]
     return {
         "guard": f"{name.upper()}_H",
-        "units": plain_text("; ".join(f"{each} [{unit}]" for each, unit in made.coefficients)),
+        "units": plain_text("; ".join(f"{coefficient} [{unit}]" for coefficient, unit in made.coefficients)),
         "constants": _constant_table(made.table, dict(made.spec.at), single),
         "frequency_list": ", ".join(map(c_literal, made.baseline.loop.monitor.frequencies)),
         "healthy": ",\n".join(f"    {{{real}, {imag}}}" for real, imag in healthy),

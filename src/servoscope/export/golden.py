@@ -51,8 +51,8 @@ def golden_signals(
     u[samples // 2 :] *= 0.8
     restart = np.zeros(samples, dtype=np.bool_)
     restart[rng.integers(0, samples, 3)] = True
-    rest = slice(3 * samples // 4, 3 * samples // 4 + samples // 20)
-    r[rest], u[rest], y[rest] = 0.0, -0.0, 0.0
+    dropout = slice(3 * samples // 4, 3 * samples // 4 + samples // 20)
+    r[dropout], u[dropout], y[dropout] = 0.0, -0.0, 0.0
     for signal, wrong in zip((r, u, y, u), (np.nan, np.inf, np.nan, 1e150), strict=True):
         begin = int(rng.integers(samples // 10, samples - 20))
         signal[begin : begin + int(rng.integers(1, 6))] = wrong

@@ -67,10 +67,10 @@ def _words(made: ExportConstants) -> dict[str, Any]:
     }
     return (
         _blocks(texts, made.recursion.constants[0].every if made.spec.sums else 0)
-        | {f"last_{each}": count - 1 for each, count in last.items()}
+        | {f"last_{array}": count - 1 for array, count in last.items()}
         | {
             "rate": f"{baseline.loop.sample_rate:g}",
-            "units": plain_text("; ".join(f"{each} {unit}" for each, unit in made.coefficients)),
+            "units": plain_text("; ".join(f"{coefficient} {unit}" for coefficient, unit in made.coefficients)),
             "limit": st_literal(baseline.thresholds.statistic),
             "on_delay": f"{on}.0",
             "off_delay": f"{off}.0",

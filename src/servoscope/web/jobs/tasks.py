@@ -123,8 +123,8 @@ def propose_file(progress: Progress, file: str, request: requests.ProposalReques
         {"section": line.section, "key": line.key, "value": line.value, "why": str(line.why), "doubtful": line.doubtful}
         for line in proposal.lines
     ]
-    found = _inspection_result(inspection.inspect(recording, proposal.loop), recording)
-    return {"toml": proposal.to_toml(), "lines": lines, **found}
+    inspected = _inspection_result(inspection.inspect(recording, proposal.loop), recording)
+    return {"toml": proposal.to_toml(), "lines": lines, **inspected}
 
 
 def _inspection_result(result: inspection.Inspection, recording: Recording) -> JsonObject:

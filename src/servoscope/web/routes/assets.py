@@ -139,13 +139,13 @@ def get_sizes(context: ContextDep, asset: str, query: Annotated[SizeQuery, Query
     """Return how its faults, or its coefficients, have changed over a time."""
     find_asset(context, asset)
     kinds = FAULT_KINDS if query.of == "faults" else ("coefficient",)
-    found = read_series(context.store, asset, query.span, kinds) if context.store.has_sizes else {}
+    series = read_series(context.store, asset, query.span, kinds) if context.store.has_sizes else {}
     columns = ("t", "value", "low", "high", "healthy")
     curves = [
         sizes.SizeCurve.model_validate(
             {"kind": kind, "name": name, **dict(zip(columns, thin_columns(rows, query.points).tolist(), strict=True))}
         )
-        for (kind, name), rows in found.items()
+        for (kind, name), rows in series.items()
     ]
     return sizes.SizeHistory(asset=asset, curves=curves)
 
