@@ -17,6 +17,7 @@ from servoscope.core.errors import ConfigError
 from servoscope.service.build import build_assets, build_source, check_service_file
 from servoscope.service.config import ServiceFile
 from servoscope.service.diagnosis_worker import find_due_prognosis
+from servoscope.service.sources.block import Block
 from servoscope.service.sources.message import InboxMessage
 from servoscope.simulation.arm import simulated_arm_loop
 
@@ -102,6 +103,22 @@ def test_a_killed_service_asks_for_the_diagnosis_again(folder: Path) -> None:
     assert due.since == pytest.approx(BEGAN + ONSET_S, abs=2.0)
     again.run()
     assert asked(config, "SELECT verdict, t, summary FROM diagnoses ORDER BY t") == first
+
+
+def test_after_a_pause_a_window_is_filled_before_it_is_diagnosed(folder: Path) -> None:
+    asset = build_assets(ServiceFile.load(replayed_arm(folder, "paused")))["cell"]
+
+    def pending_after(seconds: range, start: float) -> int:
+        for second in seconds:
+            t = start + second + 0.01 * np.arange(100)
+            asset.process(Block("cell", second, t, *np.zeros((3, 100)), covariates=np.zeros((12, 100))))
+        return len(asset.pending_diagnoses)
+
+    whole = pending_after(range(40), BEGAN)
+    assert whole in (1, 2)  # the first one comes at the asset's own place in the period
+    assert pending_after(range(40, 48), BEGAN + 600.0) == whole
+    assert pending_after(range(48, 55), BEGAN + 600.0) == whole + 1
+    assert pending_after(range(55, 60), BEGAN - 3600.0) == whole + 1  # a clock that is set back
 
 
 def test_what_an_arm_cannot_be_is_refused_in_one_line(folder: Path) -> None:

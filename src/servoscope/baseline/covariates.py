@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.messages import Message, message
 
-EDGE_SHARE = 0.05  # share of the learned range, by which a covariate may be outside of it
+EDGE_SHARE = 0.2  # share of the learned range, by which a covariate may be outside of it, where slopes are less certain
 
 
 class WarmUp(BaseModel):

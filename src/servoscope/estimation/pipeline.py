@@ -47,6 +47,16 @@ class Regression:
     z: FloatArray
     ok: BoolArray  # whether the sample may update an estimator, shape (N,)
 
+    @property
+    def halves(self) -> tuple[Regression, Regression]:
+        """The first and the second half of the samples."""
+        middle = len(self.eta) // 2
+        return self.rows(slice(middle)), self.rows(slice(middle, None))
+
+    def rows(self, rows: slice) -> Regression:
+        """Return some of the samples."""
+        return Regression(self.eta[rows], self.phi[rows], self.z[rows], self.ok[rows])
+
 
 @dataclass(frozen=True, eq=False)
 class Estimates:

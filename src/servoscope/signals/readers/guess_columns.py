@@ -113,6 +113,12 @@ SPEED_WORDS = {
     *("speed", "velocity", "rpm", "drehzahl", "istdrehzahl", "geschwindigkeit", "istgeschwindigkeit"),
     *("vitesse", "velocita", "velocidad", "速度", "转速"),
 }
+PRESSURE_WORDS = {"p", "pressure", "druck", "press", "pression", "pressione", "presion", "压力"}
+PRESSURE_SIDES = {
+    "A": {"a"},
+    "B": {"b"},
+    "supply": {"s", "supply", "pump", "system", "versorgung", "pumpe", "pompe", "pompa", "bomba"},
+}
 # parts of a message's stamp and counters, which are no signals whatever else their names say
 STAMP_WORDS = {"stamp", "timestamp", "sec", "nanosec", "nsec", "secs", "nsecs", "seq"}
 MEASURED_WORDS = {"actual", "act", "ist", "measured", "meas", "feedback", "fbk", "mesure", "misura", "reelle", "real"}
@@ -212,6 +218,17 @@ def guess_mapping(names: Sequence[str]) -> dict[str, Any]:
         fields["time"] = " + ".join(clock)
     unit = "s" if len(clock) > 1 else TIME_UNITS.get(split_unit(columns.get("t", ""))[1], "s")
     return {**fields, "time_unit": unit, "segment": []}
+
+
+def guess_pressures(names: Sequence[str]) -> dict[str, str] | None:
+    """Return the columns of the pressures at a piston's sides A and B and of its supply; None without all three."""
+    parts = {name: _words(name) for name in names}
+    chosen = {
+        side: next((name for name in names if parts[name] & PRESSURE_WORDS and parts[name] & words), None)
+        for side, words in PRESSURE_SIDES.items()
+    }
+    columns = {side: scaled_channel(name) for side, name in chosen.items() if name is not None}
+    return columns if len({*columns.values()}) == len(PRESSURE_SIDES) else None
 
 
 def names_speed(channel: str) -> bool:

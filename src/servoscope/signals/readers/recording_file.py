@@ -191,10 +191,12 @@ def _read_rows(
     sensors = columns.outputs if len(columns.outputs) > 1 else ()
     texts_by_key = {"reference": (columns.reference,), "input": (columns.input,), "output": columns.outputs}
     texts_by_key |= {f"covariates.{covariate}": (text,) for covariate, text in columns.covariates.items()}
-    carried = (*sensors, *columns.covariates)
+    of_plant = {} if loop is None else loop.plant.channels
+    carried = (*sensors, *columns.covariates, *of_plant)
+    labelled = {f"[columns] {key}": several for key, several in texts_by_key.items()}
+    labelled |= {f"[plant] {channel}": (text,) for channel, text in of_plant.items()}
     signals = {
-        f"[columns] {key}": [_parse_signal(opened, text, f"{name}: [columns] {key}") for text in several]
-        for key, several in texts_by_key.items()
+        key: [_parse_signal(opened, text, f"{name}: {key}") for text in several] for key, several in labelled.items()
     }
     unwrappers = {
         (name, period): Unwrapper(period)
@@ -240,6 +242,7 @@ def _read_rows(
         if sensors:
             values += evaluated["[columns] output"]
         values += [evaluated[f"[columns] covariates.{covariate}"][0] for covariate in columns.covariates]
+        values += [evaluated[f"[plant] {channel}"][0] for channel in of_plant]
         for value, mine in rows.items():
             if value not in parts:
                 parts[value] = LoggedRows(name if by is None else f"{name}[{by}={value}]", *options)
