@@ -75,7 +75,7 @@ class ChangeTest:
     def weigh(self) -> ChangeEvidence:
         """Return the evidence of the recording itself."""
         r, drifted = self._change_vector(self._information.g[None])
-        found = []
+        evidences = []
         for cause, term, log_prior in zip(self._causes, self._terms, self._log_prior, strict=True):
             sizes = term.sizes(r)[0]
             logs = term.log_factors(r)[0] + drifted[0]
@@ -85,13 +85,13 @@ class ChangeTest:
             off = sizes - size
             covariance = np.einsum("k,kij->ij", onset, term.covariance) + np.einsum("k,ki,kj->ij", onset, off, off)
             log_factor = total - float(np.logaddexp.reduce(drifted[0])) + float(log_prior)
-            found.append(CauseEvidence(cause, log_factor, onset, size, covariance))
-        logs = np.array([evidence.log_factor for evidence in found])
+            evidences.append(CauseEvidence(cause, log_factor, onset, size, covariance))
+        logs = np.array([evidence.log_factor for evidence in evidences])
         order = np.argsort(-logs)
         total = float(np.logaddexp.reduce(logs))
         probability = np.exp(logs[order] - total)
         t = self._information.t[:-1]
-        return ChangeEvidence(t, total, tuple(found[i] for i in order), probability)
+        return ChangeEvidence(t, total, tuple(evidences[i] for i in order), probability)
 
     def healthy_limit(self, share: float) -> float:
         """Return what the logarithm of the Bayes factor of any change exceeds in a share of healthy recordings.
