@@ -319,16 +319,15 @@ def in_lake(case: Case, folder: Path) -> Outcome:
 def in_c(case: Case) -> Outcome:
     """Export to C what can be exported."""
     reasons, baseline = dict.fromkeys((REFIT, TIMELINE), ALARM_ONLY), case.one
-    if COVARIATES in case.learned:
-        reasons[COVARIATES] = refusal(lambda: export_c(case.one))
-        baseline = baseline.at({"load": LOAD}) if reasons[COVARIATES] else baseline
     if FEATURES in case.learned:
         reasons[FEATURES] = reasons[PAST] = refusal(lambda: export_c(baseline))
         baseline = baseline.model_copy(update={"features": None})
     made = export_c(baseline)
     if MOTION in case.learned:
         reasons[MOTION] = UNSEEN_MOTION if UNSEEN_MOTION in made.files["servo_monitor.h"] else ""
-    works = {SEQUENTIAL: "update_cusums" in made.files["servo_monitor.c"], POINTS: True, POPULATION: True}
+    source = made.files["servo_monitor.c"]
+    works = {SEQUENTIAL: "update_cusums" in source, COVARIATES: "follow_covariates" in source}
+    works |= {POINTS: True, POPULATION: True}
     return outcome("C export", works, reasons)
 
 

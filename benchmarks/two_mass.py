@@ -68,14 +68,12 @@ class Score(NamedTuple):
 
 def product_score(
     name: str,
-    loop: ss.Loop,
-    learned: Sequence[ss.Recording],
+    baseline: ss.Baseline,
     healthy: Sequence[ss.Recording],
     faulty: Sequence[ss.Recording],
     changes: Sequence[two_mass.Change],
 ) -> Score:
-    """Return the score of servoscope with a loop file."""
-    baseline = ss.learn(loop, learned)
+    """Return the score of servoscope with a baseline."""
     false = sum(ss.diagnose(baseline, day).verdict == "fault" for day in healthy)
     found, named, wrong, inside = [], 0, 0, 0
     for day, change in zip(faulty, changes, strict=True):
@@ -93,12 +91,9 @@ def product_score(
     return Score(name, false, tuple(found), named, wrong, inside)
 
 
-def half_speed(loop: ss.Loop, learned: Sequence[ss.Recording], count: int) -> tuple[int, str]:
+def half_speed(baseline: ss.Baseline, healthy: Sequence[ss.Recording], worn: ss.Recording) -> tuple[int, str]:
     """Return how many healthy days at half the speed are called faulty, and the verdict on doubled friction there."""
-    baseline = ss.learn(loop, learned)
-    days = [two_mass.record_day(900 + k, speed=HALF_SPEED) for k in range(count)]
-    worn = two_mass.record_day(950, two_mass.Change("friction", 2.0), speed=HALF_SPEED)
-    return sum(ss.diagnose(baseline, day).verdict == "fault" for day in days), ss.diagnose(baseline, worn).verdict
+    return sum(ss.diagnose(baseline, day).verdict == "fault" for day in healthy), ss.diagnose(baseline, worn).verdict
 
 
 @with_one_blas_thread
@@ -113,11 +108,11 @@ def main() -> None:
     learned, healthy = two_mass.learned_days(seed=given.seed), two_mass.healthy_days(given.healthy, seed=given.seed)
     changes = two_mass.FAULTS[: given.faults]
     faulty = two_mass.faulty_days(changes, seed=given.seed)
-    plain, logged = ss.Loop.from_dict(LOOP), ss.Loop.from_dict(LOOP | COVARIATES)
-    scores = [
-        product_score("servoscope", plain, learned, healthy, faulty, changes),
-        product_score("servoscope, temperature logged", logged, learned, healthy, faulty, changes),
-    ]
+    baselines = {
+        "servoscope": ss.learn(ss.Loop.from_dict(LOOP), learned),
+        "servoscope, temperature logged": ss.learn(ss.Loop.from_dict(LOOP | COVARIATES), learned),
+    }
+    scores = [product_score(name, baseline, healthy, faulty, changes) for name, baseline in baselines.items()]
     for detector in detectors(two_mass.CYCLE_S, CUTOFF_HZ):
         judged = judge(detector, learned, [*healthy, *faulty])
         above = [score > judged.limit for score in judged.largest]
@@ -139,17 +134,34 @@ def main() -> None:
             hits = [hit for hit, change in zip(score.found, changes, strict=True) if change.kind == kind]
             cells.append(f"{sum(hits)} of {len(hits)}")
         kinds.append((kind, *cells))
-    values = {}
-    for name, loop in (("plain", plain), ("logged", logged)):
-        if given.half:
-            false, verdict = half_speed(loop, learned, given.half)
-            values |= {f"{name}.half speed.false": f"{false} of {given.half}", f"{name}.half speed.friction": verdict}
+    slow = [two_mass.record_day(1000 * given.seed + 900 + k, speed=HALF_SPEED) for k in range(given.half)]
+    worn = two_mass.record_day(1000 * given.seed + 950, two_mass.Change("friction", 2.0), speed=HALF_SPEED)
+    halves = []
+    for name, baseline in baselines.items():
+        false, verdict = half_speed(baseline, slow, worn)
+        halves.append((name, f"{false} of {given.half}", verdict))
     heads = "detector", "false", "found", "named right", "named wrong", "sizes within their interval"
     tables = [
-        Table("Two masses: detectors", f"{len(learned)} healthy days learned.", heads, tuple(summary)),
-        Table("Two masses: faults", "Found.", ("fault", *(score.name for score in scores)), tuple(kinds)),
+        Table(
+            "Two masses: detectors",
+            f"{len(learned)} healthy days learned; {len(healthy)} healthy days and {len(changes)} faults judged.",
+            heads,
+            tuple(summary),
+        ),
+        Table(
+            "Two masses: faults",
+            "How many of each kind are found, in three sizes, from the start and from the middle.",
+            ("fault", *(score.name for score in scores)),
+            tuple(kinds),
+        ),
+        Table(
+            "Two masses: half speed",
+            "Healthy days called faulty, and the verdict on doubled friction.",
+            ("detector", "false", "doubled friction"),
+            tuple(halves),
+        ),
     ]
-    show(tables, given.json, values)
+    show(tables, given.json, {f"{score.name}.found": row[2] for score, row in zip(scores, summary, strict=True)})
 
 
 if __name__ == "__main__":

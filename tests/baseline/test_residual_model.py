@@ -85,9 +85,26 @@ def test_an_alarm_of_the_residual_alone_is_explained(learned: ss.Baseline) -> No
     diagnosis = ss.diagnose(baseline, day(42, FaultEvent("pump_pressure", 0.85, 0.0)))
     assert diagnosis.verdict == "fault"
     assert any("what the healthy coefficients leave of u" in str(reason) for reason in diagnosis.reasons)
-    whole = ss.diagnose(learned, day(42, FaultEvent("pump_pressure", 0.85, 0.0)))
-    assert [fault.name for fault in whole.faults] == ["supply"]
-    assert whole.faults[0].interval[0] < 0.86 < whole.faults[0].interval[1] + 0.03
+
+
+@pytest.mark.parametrize(
+    ("parameter", "name", "ratio"), [("pump_pressure", "supply", 0.92), ("gain_retract", "valve_backward", 0.92)]
+)
+def test_a_stretch_names_a_fault_with_its_size(learned: ss.Baseline, parameter: str, name: str, ratio: float) -> None:
+    for seed, at_s in ((43, 0.0), (44, 12.0)):
+        diagnosis = ss.diagnose(learned, day(seed, FaultEvent(parameter, ratio, at_s)))
+        assert [fault.name for fault in diagnosis.faults] == [name]
+        low, high = diagnosis.faults[0].interval
+        assert low < ratio < high
+        assert high - low < 0.1
+
+
+def test_halves_scatter_and_few_samples_more(learned: ss.Baseline) -> None:
+    model = model_of(learned)
+    C = model.stretch_covariance(model.samples)
+    np.testing.assert_array_equal(C, np.array(model.halves))
+    np.testing.assert_allclose(model.stretch_covariance(0.25 * model.samples), 2.0 * C)
+    assert np.linalg.eigvalsh(C / np.outer(*2 * [np.sqrt(np.diag(C))])).min() > 0.05
 
 
 def test_a_short_recording_is_no_fault(learned: ss.Baseline) -> None:

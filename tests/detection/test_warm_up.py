@@ -139,7 +139,7 @@ def test_what_cannot_be_told_apart_is_said(baseline: ss.Baseline) -> None:
 
 
 def test_who_cannot_carry_it_says_so(baseline: ss.Baseline, tmp_path: Path) -> None:
-    with pytest.raises(BaselineError, match="an exported monitor knows no covariates"):
+    with pytest.raises(BaselineError, match="hidden_warm_up = false"):
         ExportConstants.from_baseline(baseline)
     with pytest.raises(LoopError, match="not beside"):
         ss.Loop.from_dict({**LOOP.to_dict(), "columns": {"covariates": {"oil": "T_oil"}}})

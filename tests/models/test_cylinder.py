@@ -55,11 +55,16 @@ class TestPlant:
     def test_what_faults_move(self) -> None:
         plant = CylinderPlant(coefficients=COEFFICIENTS)
         weak = plant.with_ratios({"supply_pressure": 0.81}).theta() / plant.theta()
-        np.testing.assert_allclose(weak, [0.81**-0.5] * 3 + [0.81**-1.5, 1.0, 1.0])
+        share = 0.5 / 0.85  # of the pressure that the load leaves
+        np.testing.assert_allclose(weak, 0.81 ** -np.array([0.5, share, share, 1.0 + share, 0.0, 0.0]))
         worn = plant.with_ratios({"gain_forward": 0.8}).theta() / plant.theta()
-        np.testing.assert_allclose(worn, [1.0, 1.25, 1.0, 0.8**-0.5, 1.0, 1.0])
+        np.testing.assert_allclose(worn, [0.8**-0.5, 1.25, 1.0, 0.8**-0.5, 1.0, 1.0])
         assert {fault.name for fault in plant.faults} >= {"supply", "valve_forward", "overlap", "lag", "friction"}
         assert "leakage" not in {fault.name for fault in plant.faults}  # no term shows it
+
+    def test_friction_weighs_more_on_the_smaller_area(self) -> None:
+        powers = CylinderPlant().exponents("load", COEFFICIENTS)
+        assert powers["velocity_backward"] / powers["velocity_forward"] == pytest.approx((50.0 / 40.0) ** 2)
 
     def test_it_is_not_simulated_from_its_coefficients(self) -> None:
         with pytest.raises(LoopError, match="simulate_cylinder"):

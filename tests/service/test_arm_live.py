@@ -14,8 +14,11 @@ from halls import asked, service_of
 
 from servoscope.baseline.arm import ArmBaseline
 from servoscope.core.errors import ConfigError
-from servoscope.service.build import build_assets, check_service_file
+from servoscope.service.build import build_assets, build_source, check_service_file
 from servoscope.service.config import ServiceFile
+from servoscope.service.diagnosis_worker import find_due_prognosis
+from servoscope.service.sources.block import Block
+from servoscope.service.sources.message import InboxMessage
 from servoscope.simulation.arm import simulated_arm_loop
 
 pytestmark = pytest.mark.slow  # minutes of six joints are simulated and diagnosed
@@ -65,7 +68,10 @@ def test_messages_of_all_joints_name_the_joint_and_raise_the_alarm(folder: Path,
     found = asked(config, "SELECT verdict, t, summary, onset, document FROM diagnoses ORDER BY t")
     assert [row[0] for row in found][:1] == ["healthy"]
     _, _, summary, onset, document = next(row for row in found if row[0] == "fault")
-    assert summary.startswith("Fault: friction of elbow.") and " since 2026-01-01 00:00:4" in summary
+    assert (
+        summary.startswith("Fault: friction of elbow. Coulomb friction is 1.")
+        and " since 2026-01-01 00:00:4" in summary
+    )
     assert onset == pytest.approx(BEGAN + ONSET_S, abs=2.0)
     (fault,) = json.loads(document)["faults"]
     assert fault["name"] == FRICTION and fault["interval"][0] < SIZE < fault["interval"][1]
@@ -92,8 +98,27 @@ def test_a_killed_service_asks_for_the_diagnosis_again(folder: Path) -> None:
     assert (
         state is not None and state.examination.faults[0]["name"] == FRICTION and state.baseline == asset.baseline.hash
     )
+    due = find_due_prognosis(state, {FRICTION: 2.0}, 3600.0)
+    assert due is not None and (due.fault, due.limit) == (FRICTION, 2.0)
+    assert due.since == pytest.approx(BEGAN + ONSET_S, abs=2.0)
     again.run()
     assert asked(config, "SELECT verdict, t, summary FROM diagnoses ORDER BY t") == first
+
+
+def test_after_a_pause_a_window_is_filled_before_it_is_diagnosed(folder: Path) -> None:
+    asset = build_assets(ServiceFile.load(replayed_arm(folder, "paused")))["cell"]
+
+    def pending_after(seconds: range, start: float) -> int:
+        for second in seconds:
+            t = start + second + 0.01 * np.arange(100)
+            asset.process(Block("cell", second, t, *np.zeros((3, 100)), covariates=np.zeros((12, 100))))
+        return len(asset.pending_diagnoses)
+
+    whole = pending_after(range(40), BEGAN)
+    assert whole in (1, 2)  # the first one comes at the asset's own place in the period
+    assert pending_after(range(40, 48), BEGAN + 600.0) == whole
+    assert pending_after(range(48, 55), BEGAN + 600.0) == whole + 1
+    assert pending_after(range(55, 60), BEGAN - 3600.0) == whole + 1  # a clock that is set back
 
 
 def test_what_an_arm_cannot_be_is_refused_in_one_line(folder: Path) -> None:
@@ -108,6 +133,7 @@ def test_what_an_arm_cannot_be_is_refused_in_one_line(folder: Path) -> None:
         ),
         (replay, 'files = ["run.csv"]\nlimits = { leakage = 1.5 }', "there is no fault of cell 'leakage'"),
         (rows, "", "depends on base_yaw.position, base_yaw.torque"),
+        (rows.replace("{asset}", "{asset}/{signal}"), "", "an arm needs all joints in one message"),
     ):
         with pytest.raises(ConfigError, match=why):
             check_service_file(ServiceFile.load(arm_hall(folder, "refused", source, more)))
@@ -121,3 +147,19 @@ def test_what_an_arm_cannot_be_is_refused_in_one_line(folder: Path) -> None:
     )
     baseline = ArmBaseline.load(folder / "arm.json")
     assert baseline is not None and FRICTION in baseline.fault_names
+
+
+def test_rows_of_a_plant_carry_all_joints(folder: Path) -> None:
+    columns = {name: column for name, column in simulated_arm_loop().channels.items()}
+    fields = ", ".join(f'"{name}" = "{column}"' for name, column in columns.items())
+    source = (
+        'kind = "mqtt"\nhost = "127.0.0.1"\n[sources.line.payload]\ntopics = ["plant/{asset}"]\ntime = { t = "s" }\n'
+        f'fields = {{ r = "q1", u = "i1", y = "q1", covariates = {{ {fields} }} }}'
+    )
+    with pytest.raises(ConfigError, match="r, u and y must be different ones"):
+        ServiceFile.load(arm_hall(folder, "rows", source))
+    config = ServiceFile.load(arm_hall(folder, "rows", source.replace('r = "q1"', 'r = "q2"')))
+    decoder = build_source(config, build_assets(config), "line").decoder
+    row = {"t": BEGAN, **{column: float(k) for k, column in enumerate(columns.values())}}
+    content = decoder.decode(InboxMessage("plant/cell", json.dumps(row).encode(), 0.0))
+    assert content.complete and [value for _, _, value in content.values["cell"]][3:] == list(map(float, range(12)))

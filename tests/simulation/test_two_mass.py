@@ -11,9 +11,11 @@ from scipy.integrate import solve_ivp
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 
+import two_mass as benchmark
 from public.simple_detectors import FeatureT2, judge
 from tools import two_mass
 
+import servoscope as ss
 from servoscope.core.arrays import FloatArray
 
 SAMPLES = 300  # the first move and the rest after it
@@ -69,3 +71,39 @@ def test_the_table_of_faults_is_as_hard_as_it_was() -> None:
     above = [score > scores.limit for score in scores.largest]
     assert sum(above[:8]) == 0
     assert 20 <= sum(above[8:]) <= 26
+
+
+@pytest.fixture(scope="module")
+def baseline() -> ss.Baseline:
+    return ss.learn(ss.Loop.from_dict(benchmark.LOOP | benchmark.COVARIATES), two_mass.learned_days())
+
+
+def test_half_the_speed_is_no_fault_and_hides_none(baseline: ss.Baseline) -> None:
+    """The change limit of an axis was learned under the healthy motion; at half its speed all days changed."""
+    for seed in (901, 904):  # days within the learned temperatures
+        judged = ss.diagnose(baseline, two_mass.record_day(seed, speed=0.5))
+        assert judged.verdict == "undetermined"
+        assert "motion" in {warning.kind for warning in judged.warnings}
+    worn = ss.diagnose(baseline, two_mass.record_day(950, two_mass.Change("friction", 2.0), speed=0.5))
+    assert worn.verdict == "fault"
+
+
+def test_severities_are_ordered_by_size(baseline: ss.Baseline) -> None:
+    factors = (1.3, 1.5, 1.8, 2.2, 2.8)
+    changes = [two_mass.Change("friction", factor, two_mass.MIDDLE_S) for factor in factors]
+    judged = [ss.diagnose(baseline, two_mass.record_day(240, change, start_c=25.0)) for change in changes]
+    sizes = [diagnosis.faults[0].ratio for diagnosis in judged]
+    assert sizes == sorted(sizes)
+    for diagnosis, factor in zip(judged, factors, strict=True):
+        assert [fault.name for fault in diagnosis.faults] == ["dry_friction"]
+        low, high = diagnosis.faults[0].interval
+        assert low <= factor <= high
+
+
+def test_features_find_what_is_a_little_beyond_the_learned_temperatures(baseline: ss.Baseline) -> None:
+    """Limits of features widen beyond the learned range; the coefficients' covariates end there."""
+    cold = {"start_c": two_mass.COLD_C - 1.0}
+    assert ss.diagnose(baseline, two_mass.record_day(260, **cold)).verdict == "undetermined"
+    worn = ss.diagnose(baseline, two_mass.record_day(260, two_mass.Change("payload", 1.4), **cold))
+    assert worn.verdict == "fault" and not worn.faults
+    assert "signals" in {warning.kind for warning in worn.warnings}

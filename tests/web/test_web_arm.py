@@ -15,6 +15,10 @@ from halls import service_of
 from opening import accessible
 from screens import asked
 
+from servoscope.core.errors import RecordingError
+from servoscope.web.jobs.tasks import diagnose_file
+from servoscope.web.schemas.requests import DiagnosisRequest
+
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is missing: make install brings it")
 expect = playwright.expect
 
@@ -31,9 +35,13 @@ def test_an_arm_and_its_log(chromium: Any, tmp_path: Path) -> None:
         assert (size["name"], size["parameter"]) == (FRICTION, "elbow.coulomb_friction")
         moved = {one["name"]: (one["value"] - one["nominal"]) / one["std"] for one in asset["parameters"]}
         assert max(moved, key=lambda name: abs(moved[name])) == "elbow.coulomb_friction"
+        assert [one["unit"] for one in asset["parameters"]][:3] == ["N m", "N m s", "N m"]
         assert [check["fault"] for check in asset["checks"]] == [FRICTION]
         assert asset["checks"][0]["texts"] == ["Lubrication, bearings, seals and brake of the joint; its temperature"]
         assert asked(base, "/assets/cell/relearning") is None and asked(base, "/assets/cell/limits") == {"limits": []}
+        repair = {"t": asset["t"], "text": "gear", "kind": "repair"}
+        noted = httpx.post(f"{base}/api/v1/assets/cell/notes", json=repair, headers={"Origin": base})
+        assert noted.status_code == 409 and "an arm learns from logs" in noted.text
         (learned,) = asked(base, "/baselines")["baselines"]
         assert learned["columns"]["covariates"]["elbow.torque"] == "i3"
         assert asked(base, f"/baselines/{learned['id']}")["summary"]["joints"].keys() >= {"elbow"}
@@ -44,8 +52,9 @@ def test_an_arm_and_its_log(chromium: Any, tmp_path: Path) -> None:
         with httpx.Client(base_url=f"{base}/api/v1", timeout=60.0) as client:
             file = upload(client, "run.csv", (tmp_path / "run.csv").read_bytes()).json()
             wanted = {"upload": file["id"], "baseline": learned["id"]}
-            refused = finished(client, client.post("/diagnoses", json={**wanted, "from_s": 10.0}))
-            assert refused["state"] == "failed" and "from_s: not for an arm, leave out" in str(refused)
+            request = DiagnosisRequest.model_validate({**wanted, "from_s": 10.0})
+            with pytest.raises(RecordingError, match="from_s: not for an arm, leave out"):
+                diagnose_file(lambda _: None, str(tmp_path / "run.csv"), request, str(tmp_path / "arm.json"), "", "")
             done = finished(client, client.post("/diagnoses", json=wanted))
             found = asked(base, f"/diagnoses/{done['result']['diagnosis']}")
             assert found["document"]["faults"][0]["name"] == FRICTION and max(found["arm"]["odds"]) > 0.9

@@ -126,13 +126,13 @@ def _scale_features(
     fit: models.ModelComparison, margins: models.Margins, u: FloatArray, y: FloatArray, scale: int
 ) -> dict[str, float]:
     f: dict[str, float] = {}
-    for name, model, more in (
+    for name, model, parameters in (
         ("stick", fit.stick, 2),
         ("dead band", fit.dead_band, 1),
         ("clip", fit.clip, 1),
         ("outside", fit.outside, 2),
     ):
-        gain = max(fit.gain(model, more), 0.0)
+        gain = max(fit.gain(model, parameters), 0.0)
         f[f"{name} gain"] = min(float(np.sqrt(gain / fit.samples)), 1.0)
         f[f"{name} evidence"] = float(np.log1p(gain))
     f["slip"] = _signed_log(fit.between(fit.dead_band, fit.stick))

@@ -54,8 +54,8 @@ def find_oscillation(x: FloatArray) -> Oscillation | None:
     padded = np.fft.rfft(band, 2 * n)
     rho = np.fft.irfft(np.abs(padded) ** 2)[: n // 2]
     crossings = np.flatnonzero(rho[:-1] * rho[1:] < 0.0)[: MAX_INTERVALS + 1]
-    rest = x - np.fft.irfft(np.where(frequency < peak / 3.0, whole, 0.0), n)  # without what is slower
-    share = min(float(band.var() / max(rest.var(), 1e-300)), 1.0)
+    faster = x - np.fft.irfft(np.where(frequency < peak / 3.0, whole, 0.0), n)  # without what is slower
+    share = min(float(band.var() / max(faster.var(), 1e-300)), 1.0)
     if crossings.size < MIN_CROSSINGS:
         return Oscillation(1.0 / float(peak), 0.0, share, band)
     at = crossings + rho[crossings] / (rho[crossings] - rho[crossings + 1])

@@ -48,9 +48,9 @@ class ModelComparison(NamedTuple):
     outside: ModelFit
     samples: int
 
-    def gain(self, fit: ModelFit, more: int) -> float:
-        """Return ln L of a model above the linear loop's; `more` parameters cost ln(M)/2 each (Schwarz, 1978)."""
-        return self.between(self.linear, fit) - 0.5 * more * float(np.log(self.samples))
+    def gain(self, fit: ModelFit, parameters: int) -> float:
+        """Return ln L of a model above the linear loop's; `parameters` parameters cost ln(M)/2 each (Schwarz, 1978)."""
+        return self.between(self.linear, fit) - 0.5 * parameters * float(np.log(self.samples))
 
     def between(self, fit: ModelFit, better: ModelFit) -> float:
         """Return ln L of a model above another's."""

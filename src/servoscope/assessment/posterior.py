@@ -59,8 +59,8 @@ class CausePosterior:
     def of(self, features: Mapping[str, float], sample_rate: float) -> dict[Cause, float]:
         """Return the probability of each cause for one log with a sample rate [Hz]."""
         row = np.array([[features[name] for name in self.names]])
-        found = self.probabilities(row, process=sample_rate <= MAX_PROCESS_RATE_HZ)
-        return dict(zip(CAUSES, found[0].tolist(), strict=True))
+        posterior = self.probabilities(row, process=sample_rate <= MAX_PROCESS_RATE_HZ)
+        return dict(zip(CAUSES, posterior[0].tolist(), strict=True))
 
 
 def expand_features(features: FloatArray, mean: FloatArray, std: FloatArray) -> FloatArray:

@@ -165,6 +165,12 @@ class ArmBaseline(BaselineModel):
         return tuple(self.loop.channels)
 
     @property
+    def coefficient_units(self) -> tuple[str, ...]:
+        """Units of the Coulomb friction, viscous friction and offset of each joint, which diagnoses estimate."""
+        units = {False: ("N m", "N m s", "N m"), True: ("N", "N s/m", "N")}
+        return tuple(unit for is_slide in self.model.arm.prismatic for unit in units[bool(is_slide)])
+
+    @property
     def fault_names(self) -> tuple[str, ...]:
         """Names of the faults that may be found."""
         return tuple(dict.fromkeys(cause.name for cause in self.causes if cause.kind != UNKNOWN))

@@ -17,6 +17,7 @@ from servoscope.baseline.feature_model import FeatureModel
 from servoscope.baseline.learned_fault import LearnedFault
 from servoscope.baseline.motion import MotionRange
 from servoscope.baseline.plant_fit import fault_directions, match_ratios
+from servoscope.baseline.pressure_model import PressureModel
 from servoscope.baseline.records import (
     AlarmThresholds,
     BaselineMemory,
@@ -70,10 +71,11 @@ class Baseline(ShortRepr, BaselineMemory):
         Warnings of `learn`; faults known from labelled recordings.
     exact
         What the exact predictor says of the healthy recordings; None where there is none.
-    sensors, features, motion, axis, covariates, residual
+    sensors, features, motion, axis, covariates, residual, pressures
         Further evidence, None where there is none: how the sensors of the output disagree; what four or more recordings
         show besides coefficients; the motion that they hold; the healthy motor axis that its refit starts from; how
-        coefficients move with covariates, theta being theirs in the middle of the learned range; what these leave of u.
+        coefficients move with covariates, theta being theirs in the middle of the learned range; what these leave of u;
+        what logged pressures of a cylinder show.
     point, others
         Name of the operating point, empty where none was declared; the baselines of the other points. A baseline with
         others is itself that of the first point.
@@ -107,6 +109,7 @@ class Baseline(ShortRepr, BaselineMemory):
     axis: AxisModel | None = None
     covariates: CovariateModel | None = None
     residual: ResidualModel | None = Field(default=None, exclude_if=lambda value: value is None)
+    pressures: PressureModel | None = Field(default=None, exclude_if=lambda value: value is None)
     point: str = ""
     others: tuple[Baseline, ...] = ()
     revision: Revision = Revision()
@@ -349,7 +352,7 @@ class Baseline(ShortRepr, BaselineMemory):
             ) from None
         if isinstance(content, Mapping) and content.get("format") == ARM_FORMAT:
             raise BaselineError(
-                f"{path}: baseline of an arm, which diagnose, services and fleets take, and no other command"
+                f"{path}: baseline of an arm, whose torques depend on all joints: diagnose, services and fleets take it"
             )
         if not isinstance(content, Mapping) or content.get("format") != FORMAT:
             raise BaselineError(f"{path}: is not a baseline; give the file that servoscope learn wrote")

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.messages import Message, message
 
-EDGE_SHARE = 0.05  # share of the learned range, by which a covariate may be outside of it
+EDGE_SHARE = 0.2  # share of the learned range, by which a covariate may be outside of it, where slopes are less certain
 
 
 class WarmUp(BaseModel):
@@ -54,7 +54,7 @@ class CovariateModel(BaseModel):
         return np.asarray(0.5 * (np.array(self.low) + np.array(self.high)))
 
     @cached_property
-    def _known(self) -> tuple[FloatArray, FloatArray]:
+    def known(self) -> tuple[FloatArray, FloatArray]:
         """The learned range and what is next to it, shapes (k,)."""
         edge = EDGE_SHARE * (np.array(self.high) - np.array(self.low))
         return np.asarray(self.low - edge), np.asarray(self.high + edge)
@@ -87,7 +87,7 @@ class CovariateModel(BaseModel):
 
     def clip(self, c: FloatArray) -> FloatArray:
         """Return covariates (..., k) held where something is known: within the learned range, or next to it."""
-        return np.asarray(np.clip(c, *self._known))
+        return np.asarray(np.clip(c, *self.known))
 
     def values(self, channels: Mapping[str, FloatArray]) -> FloatArray:
         """Return the covariates among the channels of a block, shape (N, k); NaN where one is missing."""
@@ -111,7 +111,7 @@ class CovariateModel(BaseModel):
 
     def is_inside(self, c: FloatArray) -> BoolArray:
         """Return whether all covariates (..., k) are within the learned range, or next to it."""
-        low, high = self._known
+        low, high = self.known
         return np.asarray(((c >= low) & (c <= high)).all(axis=-1))
 
     def describe_outside(self, c: FloatArray) -> Message | None:
@@ -145,8 +145,8 @@ class CovariateAverage:
     """
 
     def __init__(self, covariates: int, memory: float) -> None:
-        """`memory`: in samples."""
-        self.size, self._keep = 3 * covariates, 1.0 - 1.0 / memory
+        """`memory`: in samples; an average keeps `keep` of itself per sample."""
+        self.size, self.keep = 3 * covariates, 1.0 - 1.0 / memory
 
     def start(self) -> FloatArray:
         """Return the state before the first sample: last known values, and those of the filter, shape (size,)."""
@@ -165,15 +165,15 @@ class CovariateAverage:
                 continue
             first = int(known[0])
             if np.isnan(z[j, 0]):
-                z[j] = self._keep * held[first, j], 0.0  # as if it had been so for ever
-            b, a = np.array([1.0 - self._keep]), np.array([1.0, -self._keep])
+                z[j] = self.keep * held[first, j], 0.0  # as if it had been so for ever
+            b, a = np.array([1.0 - self.keep]), np.array([1.0, -self.keep])
             averages[first:, j] = lfilter(b, a, held[first:, j], z[j : j + 1])
         last[:] = held[-1] if len(held) else last
         return averages
 
     def latest(self, state: FloatArray) -> FloatArray:
         """Return the average in a state, shape (k,)."""
-        return state[self.size // 3 :: 2] / self._keep
+        return state[self.size // 3 :: 2] / self.keep
 
 
 @dataclass(frozen=True, eq=False)

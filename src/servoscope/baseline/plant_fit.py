@@ -199,5 +199,6 @@ def fault_directions(
             return nominal_theta(loop, plant.scaled({parameter: ratio}))
 
         return {p: (at(np.exp(step), p) - at(np.exp(-step), p)) / (2.0 * step) for p in parameters}
-    moved = {p: plant.exponents(p) for p in parameters}
+    healthy = dict(zip(plant.names, theta.tolist(), strict=True))
+    moved = {p: plant.exponents(p, healthy) for p in parameters}
     return {p: np.array([powers.get(name, 0.0) for name in plant.names]) * theta for p, powers in moved.items()}

@@ -25,7 +25,7 @@ Matrix = tuple[Vector, ...]
 # what a baseline remembers: computed from the fields of its loop alone, or from any but some that stand beside it
 OF_LOOP, OF_ALL = ("loop", "_pipeline"), ("baseline_run", "bias", "fault_directions")
 LOOP_FIELDS = {"loop", "loop_settings", "recursion"}
-SEPARATE_FIELDS = {"features", "residual", "point", "others"}
+SEPARATE_FIELDS = {"features", "residual", "pressures", "point", "others"}
 
 
 class BaselineModel(BaseModel):

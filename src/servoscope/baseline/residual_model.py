@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
+from pydantic import Field
 
 from servoscope.baseline.feature_model import FeatureGroup, GroupStatistic, is_near
 from servoscope.baseline.records import BaselineModel, Matrix, Vector
@@ -145,6 +146,8 @@ class ResidualModel(BaselineModel):
     samples: float  # of a recording, on average
     groups: tuple[FeatureGroup, FeatureGroup]  # whole recordings; second halves less first ones
     limits: tuple[float, float] = (1.0, 1.0)  # of T^2/d
+    # covariance (n, n) of coefficients fitted to half a recording, about the healthy ones; empty where not compared
+    halves: Matrix = Field(default=(), exclude_if=lambda value: not value)
 
     @classmethod
     def of(cls, layout: ResidualLayout, healthy: Sequence[RecordingResidual]) -> Self:
@@ -187,6 +190,13 @@ class ResidualModel(BaselineModel):
         moved = residual.shift - _expected_shift(whole, residual)
         scores = whole.score(residual.features[0], 2.0 * share, c), shift.score(moved, share)
         return np.array(scores) / self.limits
+
+    def stretch_covariance(self, samples: float) -> FloatArray:
+        """Return the covariance (n, n) of coefficients fitted to so many usable samples of a healthy recording.
+
+        More than half a recording is not surer: what differs from day to day does not average.
+        """
+        return np.array(self.halves) * max(1.0, 0.5 * self.samples / max(samples, 1.0))
 
 
 def _expected_shift(statistic: GroupStatistic, residual: RecordingResidual) -> FloatArray:

@@ -139,11 +139,11 @@ def show_docs() -> None:
 
 
 def _context_of(whole: Any, name: str) -> Any:
-    found = whole.command.get_command(whole, name) if isinstance(whole.command, CommandGroup) else None
-    if found is None:
-        known = ", ".join(each for group in GROUPS.values() for each in group)
+    subcommand = whole.command.get_command(whole, name) if isinstance(whole.command, CommandGroup) else None
+    if subcommand is None:
+        known = ", ".join(command for group in GROUPS.values() for command in group)
         raise typer.BadParameter(f"{name!r} is no command; there are {known}")
-    return type(whole)(found, info_name=name, parent=whole)
+    return type(whole)(subcommand, info_name=name, parent=whole)
 
 
 def iter_commands(group: typer.Typer, prefix: str = "") -> Iterator[tuple[str, Any]]:

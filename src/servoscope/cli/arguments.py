@@ -75,7 +75,7 @@ def parse_healthy(texts: Sequence[str]) -> list[tuple[str, Path]]:
     for text in texts:
         named = re.fullmatch(r"(\w[\w-]*)=(.+)", text)
         point, path = (named[1], Path(named[2])) if named and not Path(text).exists() else ("", Path(text))
-        healthy += [(point, each) for each in expand_files([path])]
+        healthy += [(point, file) for file in expand_files([path])]
     without = [path for point, path in healthy if not point]
     if 0 < len(without) < len(healthy):
         raise typer.BadParameter(

@@ -118,8 +118,8 @@ def _print_baseline(baseline: ArmBaseline) -> None:
     summary = baseline.summary()
     results.print_title(out, baseline.loop.name, f": {say('arm.baseline', recordings=len(baseline.sources))}")
     rows = [
-        (name, *(f"{value:.4g} ± {1.96 * std:.2g}" for value, std in each["friction"]), f"{each['unexplained']:.1%}")
-        for name, each in summary["joints"].items()
+        (name, *(f"{value:.4g} ± {1.96 * std:.2g}" for value, std in joint["friction"]), f"{joint['unexplained']:.1%}")
+        for name, joint in summary["joints"].items()
     ]
     results.print_table(out, ("joint", "viscous friction", "Coulomb friction", "unexplained"), rows)
     notes = [say("arm.undetermined_friction", names=baseline.undetermined)] if baseline.undetermined else []

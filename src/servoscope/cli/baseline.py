@@ -77,9 +77,9 @@ def add_recordings(
 
 
 def print_difference(
-    before: Baseline, after: Baseline, as_json: bool, more: Mapping[str, object] | None = None
+    before: Baseline, after: Baseline, as_json: bool, extra: Mapping[str, object] | None = None
 ) -> None:
-    """Print what moved between two baselines, and what each of them can detect; `more`: in the JSON too."""
+    """Print what moved between two baselines, and what each of them can detect; `extra`: in the JSON too."""
     from servoscope.baseline.comparison import compare_baselines
     from servoscope.cli.render import results
     from servoscope.report.format_values import format_percent
@@ -89,7 +89,7 @@ def print_difference(
         points = [difference.to_dict() for difference in differences]
         revision = after.revision.model_dump(mode="json")
         print_json(
-            {"before": before.hash, "after": after.hash, "revision": revision, "points": points, **(more or {})},
+            {"before": before.hash, "after": after.hash, "revision": revision, "points": points, **(extra or {})},
             lines=False,
         )
         return

@@ -128,11 +128,11 @@ def _propose(out: Console, logs: list[Path], columns: Columns, output: Path, ask
         try:
             with show_steps(1, 1) as steps:
                 steps.begin(log.name)
-                found = inspection.inspect(readers.read(log, proposal.loop, where=where), proposal.loop)
+                inspected = inspection.inspect(readers.read(log, proposal.loop, where=where), proposal.loop)
         except ServoscopeError:  # the notes say why
             continue
-        results.print_inspection(out, found)
-        usable += [log] * (found.verdict != "not usable")
+        results.print_inspection(out, inspected)
+        usable += [log] * (inspected.verdict != "not usable")
     if usable:
         learned = " ".join(shlex.quote(str(log)) for log in usable)
         if where:

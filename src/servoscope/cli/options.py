@@ -80,8 +80,13 @@ class ReadingOptions:
 
 def with_reading_options(*left_out: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command the options of `ReadingOptions`, in the place of its parameter ``reading``, but for some."""
-    hints = get_type_hints(ReadingOptions, include_extras=True)
-    given = [field for field in fields(ReadingOptions) if field.name not in left_out]
+    return with_options("reading", ReadingOptions, *left_out)
+
+
+def with_options(place: str, group: type[Any], *left_out: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of a group, a dataclass, in the place of a parameter, but for some."""
+    hints = get_type_hints(group, include_extras=True)
+    given = [field for field in fields(group) if field.name not in left_out]
     options = [
         inspect.Parameter(
             field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=hints[field.name]
@@ -94,12 +99,11 @@ def with_reading_options(*left_out: str) -> Callable[[Callable[..., None]], Call
         parameters: list[inspect.Parameter] = []
         for name, parameter in inspect.signature(command).parameters.items():
             keyword = parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=own[name])
-            parameters += options if name == "reading" else [keyword]
+            parameters += options if name == place else [keyword]
 
         @functools.wraps(command)
         def run(**values: Any) -> None:
-            reading = ReadingOptions(**{field.name: values.pop(field.name) for field in given})
-            command(reading=reading, **values)
+            command(**{place: group(**{field.name: values.pop(field.name) for field in given})}, **values)
 
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}

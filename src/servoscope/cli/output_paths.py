@@ -25,7 +25,7 @@ def check_output(
     """
     if path is None:
         return
-    if any(_is_same_file(path, each) for each in inputs):
+    if any(_is_same_file(path, source) for source in inputs):
         raise typer.BadParameter(f"{option} {path}: is an input and would be overwritten, give another name")
     try:
         is_folder = path.is_dir()
@@ -43,9 +43,9 @@ def check_output(
         raise OutputError(f"{path}: cannot be written, there is no folder {path.parent}; make it first")
 
 
-def _is_same_file(one: Path, other: Path) -> bool:
+def _is_same_file(path: Path, other: Path) -> bool:
     try:
-        return one.samefile(other)
+        return path.samefile(other)
     except OSError:
         return False
 
@@ -100,9 +100,9 @@ class OutputPaths:
         self._used.add(free.casefold())
         if self._in_folder:
             make_folder(self.target)
-            found = self.target / f"{free}{self.suffix}"
+            place = self.target / f"{free}{self.suffix}"
         else:
-            found = self.target.with_name(free + self.target.suffix)
-        if any(_is_same_file(found, path) for path in self.inputs):
-            raise OutputError(f"{found}: is an input and would be overwritten, name another folder")
-        return found
+            place = self.target.with_name(free + self.target.suffix)
+        if any(_is_same_file(place, path) for path in self.inputs):
+            raise OutputError(f"{place}: is an input and would be overwritten, name another folder")
+        return place

@@ -23,9 +23,9 @@ MAX_INTERVAL_FACTOR = 60.0  # times as long is the longest silence between two l
 class StepProgress:
     """A progress bar over some parts, each in so many steps, or lines instead of it; made by `show_steps`."""
 
-    def __init__(self, bar: Progress | None, parts: int, each: int) -> None:
-        self._bar, self._each = bar, each
-        self._task = bar.add_task("", total=parts * each) if bar is not None else None
+    def __init__(self, bar: Progress | None, parts: int, label: int) -> None:
+        self._bar, self._each = bar, label
+        self._task = bar.add_task("", total=parts * label) if bar is not None else None
         self._part, self._steps_done, self._part_name, self._step, self._share = -1, 0, "", "", 0.0
 
     def begin(self, part: str) -> None:
@@ -68,7 +68,7 @@ class StepProgress:
 
 
 @contextmanager
-def show_steps(parts: int, each: int) -> Iterator[StepProgress]:
+def show_steps(parts: int, label: int) -> Iterator[StepProgress]:
     """Show a progress bar on stderr, if that is a terminal, and take it away again at the end; else lines.
 
     While a file is read, it shows how many rows of it.
@@ -78,7 +78,7 @@ def show_steps(parts: int, each: int) -> Iterator[StepProgress]:
     from servoscope.signals.readers.table import watch_reading
 
     with _bar(SpinnerColumn()) as bar:
-        steps = StepProgress(bar, parts, each)
+        steps = StepProgress(bar, parts, label)
         with nullcontext() if bar is not None else _lines(steps.describe), watch_reading(steps.count_rows):
             yield steps
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -25,6 +25,7 @@ from servoscope.cli.output_paths import REPORTS, TRACES, OutputPaths, check_outp
 from servoscope.cli.progress import StepProgress, show_steps
 
 if TYPE_CHECKING:
+    from servoscope.baseline.baseline import Baseline
     from servoscope.signals import Recording
 
 
@@ -140,10 +141,10 @@ def learn(
     """Learn from healthy recordings what healthy looks like, and from labelled ones what faults look like."""
     if add:
         others = output is not None or nominal or compare is not None or fault or population
-        more = [*add, *([str(loop)] if loop is not None else []), *(healthy or ())]
+        logs = [*add, *([str(loop)] if loop is not None else []), *(healthy or ())]
         path = None if others else baseline
         add_recordings(
-            path, more, reading, as_json, after, why, who, accept_change, accept_delay=accept_delay, force=force
+            path, logs, reading, as_json, after, why, who, accept_change, accept_delay=accept_delay, force=force
         )
         return
     if loop is None or output is None:
@@ -155,20 +156,16 @@ def learn(
         raise typer.BadParameter("give healthy recordings or --nominal, and not both")
     if (accept_change and compare is None) or (nominal and compare is not None):
         raise typer.BadParameter("--accept-change goes with --compare, and that with recordings")
-    for option, value in (("--accept-delay", accept_delay), ("--population", population), ("--fault", fault)):
-        if nominal and value:
-            raise typer.BadParameter(f"{option} goes with healthy recordings, not with --nominal")
+    given = {"--accept-delay": accept_delay, "--population": population, "--fault": fault}
+    if nominal and (wrong := next((option for option, value in given.items() if value), None)) is not None:
+        raise typer.BadParameter(f"{wrong} goes with healthy recordings, not with --nominal")
     faults = arguments.parse_labelled(fault or [], list(dict.fromkeys(point for point, _ in named)))
     files = [path for _, path in named] + [path for *_, path in faults]
     alike = arguments.expand_baselines(population or [])
     check_output(output, "-o", (), [loop, *files, *alike, *filter(None, [compare])])
 
-    from servoscope.baseline.baseline import Baseline
     from servoscope.cli.render import results
-    from servoscope.diagnosis import operating_points
-    from servoscope.learning.learn import nominal_baseline
     from servoscope.models.arm.settings import describes_arm
-    from servoscope.models.loop import Loop
     from servoscope.report import plain_values
 
     if describes_arm(loop):
@@ -177,37 +174,45 @@ def learn(
         arm.refuse_options({**options, "operating points": points, **reading.given()})
         arm.learn_baseline(loop, [path for _, path in named], output, as_json)
         return
-    settings = Loop.load(loop)
-    reader = RecordingReader.from_options(settings, reading)
-    if reader.columns is not None:  # they become part of the baseline, so that diagnose need not be told again
-        settings = settings.model_copy(update={"columns": reader.columns})
-    earlier = Baseline.load(compare) if compare is not None else None
+    acceptance = {"accept_change": accept_change, "accept_delay": accept_delay, "force": force, "population": alike}
     failures = FailureCounter()
-    with show_steps(len(files) + 1, 6 * max(1, len(dict(named)))) as steps:
-        recordings, labels = _read_labelled(reader, named, faults, steps, failures)
-        steps.begin("learning")
-        if nominal:
-            learned = nominal_baseline(settings, steps.advance)
-        else:
-            chosen, known = recordings.get("", recordings), labels.get("", labels)
-            learned = operating_points.learn(
-                settings,
-                chosen,
-                steps.advance,
-                compare=earlier,
-                accept_change=accept_change,
-                faults=known,
-                accept_delay=accept_delay,
-                force=force,
-                population=alike,
-            )
-        learned.save(output)
+    learned = _learn_plant(loop, named, faults, compare, reading, failures, acceptance)
+    learned.save(output)
     if as_json:
         print_json({"baseline": str(output), **plain_values.baseline_summary(learned)}, lines=False)
     else:
         results.print_baseline(results.create_console(), learned)
         results.print_written_path(results.create_console(), output)
     failures.exit_if_any()
+
+
+def _learn_plant(
+    loop: Path,
+    named: list[tuple[str, Path]],
+    faults: list[tuple[str, str, Path]],
+    compare: Path | None,
+    reading: ReadingOptions,
+    failures: FailureCounter,
+    acceptance: dict[str, Any],
+) -> Baseline:
+    """Read the recordings and learn from them; without any, from nominal values."""
+    from servoscope.baseline.baseline import Baseline
+    from servoscope.diagnosis import operating_points
+    from servoscope.learning.learn import nominal_baseline
+    from servoscope.models.loop import Loop
+
+    settings = Loop.load(loop)
+    reader = RecordingReader.from_options(settings, reading)
+    if reader.columns is not None:  # they become part of the baseline, so that diagnose need not be told again
+        settings = settings.model_copy(update={"columns": reader.columns})
+    earlier = Baseline.load(compare) if compare is not None else None
+    with show_steps(len(named) + len(faults) + 1, 6 * max(1, len(dict(named)))) as steps:
+        recordings, labels = _read_labelled(reader, named, faults, steps, failures)
+        steps.begin("learning")
+        if not named:
+            return nominal_baseline(settings, steps.advance)
+        chosen, known = recordings.get("", recordings), labels.get("", labels)
+        return operating_points.learn(settings, chosen, steps.advance, compare=earlier, faults=known, **acceptance)
 
 
 def _read_labelled(
@@ -333,18 +338,18 @@ def verify(
     read = reader.read(recording)
     if len(read) != 1:
         raise RecordingError(f"{recording}: holds {len(read)} recordings, choose one with --where")
-    found = verification.verify(told, learned, read[0])
+    verified = verification.verify(told, learned, read[0])
     if as_json:
-        plain = plain_values.to_plain_values(found)
+        plain = plain_values.to_plain_values(verified)
         texts = {
-            "differences": [str(difference) for difference in found.differences],
-            "remarks": [str(remark) for remark in found.remarks],
+            "differences": [str(difference) for difference in verified.differences],
+            "remarks": [str(remark) for remark in verified.remarks],
         }
         print_json({**plain, **texts} if isinstance(plain, dict) else plain, lines=False)
     else:
         out = results.create_console()
         verdict = say("verify.same", verdict=told.verdict)
-        out.print(verdict if found.same else say("verify.changed", differences=found.differences))
-        results.print_notes(out, [str(remark) for remark in found.remarks])
-    if not found.same:
+        out.print(verdict if verified.same else say("verify.changed", differences=verified.differences))
+        results.print_notes(out, [str(remark) for remark in verified.remarks])
+    if not verified.same:
         raise typer.Exit(EXIT_INPUT)

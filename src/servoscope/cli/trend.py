@@ -118,7 +118,7 @@ def _find_limit(text: str, path: Path | None, series: SizeSeries, source: str, a
     rows = [limit for limit in operating_limits(loop, [series.name]) if limit.kind == text]
     if not rows:
         raise typer.BadParameter(f"--value {series.name}: is no fault of {path}")
-    found = rows[0].side(series.value[-1])
-    if found is None:
+    side = rows[0].side(series.value[-1])
+    if side is None:
         raise typer.BadParameter(f"--limit {text}: {series.name} does not take it from this loop, give a number")
-    return found
+    return side

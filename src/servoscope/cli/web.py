@@ -104,7 +104,7 @@ def add(
     ] = False,
 ) -> None:
     """Add a user, or give one a new role and password."""
-    chosen: Role | None = next((one for one in ROLES if one == role), None)
+    chosen: Role | None = next((known for known in ROLES if known == role), None)
     if chosen is None:
         raise typer.BadParameter(f"--role {role}: choose from {', '.join(ROLES)}")
     known = Users(file)

@@ -24,4 +24,4 @@ def show_address(url: str) -> str:
 
 def hide_secrets(text: str) -> str:
     """Return a text with each URL in it as `show_address` shows it."""
-    return URLS.sub(lambda found: show_address(found[0]), text)
+    return URLS.sub(lambda match: show_address(match[0]), text)

@@ -93,20 +93,20 @@ def find_rows(
     test: Callable[[slice], npt.NDArray[np.bool_]], *columns: npt.NDArray[Any], first: int = 0
 ) -> npt.NDArray[np.intp]:
     """Return the rows of columns, from the `first` on, that pass a test of slices."""
-    found = [rows.start + np.flatnonzero(test(rows)) for rows in iter_chunks(first, columns[0].size, *columns)]
-    return np.concatenate([np.empty(0, dtype=np.intp), *found])
+    places = [rows.start + np.flatnonzero(test(rows)) for rows in iter_chunks(first, columns[0].size, *columns)]
+    return np.concatenate([np.empty(0, dtype=np.intp), *places])
 
 
 def drop_rows(column: npt.NDArray[Any], dropped: npt.NDArray[np.intp]) -> npt.NDArray[Any]:
     """Return a column without some of its rows, given in order; the column itself where there are none."""
     if not dropped.size:
         return column
-    rest = empty((column.size - dropped.size,), column.dtype)
-    for rows in iter_chunks(0, column.size, column, rest):
+    remaining = empty((column.size - dropped.size,), column.dtype)
+    for rows in iter_chunks(0, column.size, column, remaining):
         begin, end = np.searchsorted(dropped, [rows.start, rows.stop])
         kept = np.delete(column[rows], dropped[begin:end] - rows.start)
-        rest[rows.start - begin : rows.start - begin + kept.size] = kept
-    return rest
+        remaining[rows.start - begin : rows.start - begin + kept.size] = kept
+    return remaining
 
 
 class GrowableArray:

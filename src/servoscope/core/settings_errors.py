@@ -85,7 +85,7 @@ def _resolve_location(model: type[BaseModel], loc: tuple[int | str, ...]) -> tup
         while get_origin(at) is Annotated:
             at = get_args(at)[0]
         united = get_args(at) if get_origin(at) in (Union, types.UnionType) else ()
-        choices = [one for one in united if _is_model(one)]
+        choices = [member for member in united if _is_model(member)]
         if not choices and len(set(united) - {types.NoneType}) > 1:
             at = Any  # of plain types, the part is pydantic's word for the one that it tried
             continue
@@ -100,7 +100,8 @@ def _resolve_location(model: type[BaseModel], loc: tuple[int | str, ...]) -> tup
             owner = at
             at = at.model_fields[part].annotation if part in at.model_fields else Any
         elif get_args(at):
-            at = [one for one in get_args(at) if one is not ...][-1]  # the values of a table, the entries of a list
+            # the values of a table, the entries of a list
+            at = [argument for argument in get_args(at) if argument is not ...][-1]
     return place, owner
 
 

@@ -34,8 +34,8 @@ def fisher_matrix(scene: Scenario, seconds: float | None = None, exact: bool = T
 
 def cosines(columns: FloatArray, others: FloatArray) -> FloatArray:
     """Return the cosines between columns (N, p) and others (N, q), shape (p, q)."""
-    one, other = (normalise_columns(x)[0] for x in (columns, others))
-    return np.asarray(one.T @ other)
+    first, other = (normalise_columns(x)[0] for x in (columns, others))
+    return np.asarray(first.T @ other)
 
 
 def misnaming_probability(squared: FloatArray) -> float:

@@ -61,13 +61,13 @@ def hypothesis_distances(scene: Scenario, fault: Fault, x: float) -> HypothesisD
     own = window.residual(np.append(np.zeros(window.nuisance_count), x), (fault.parameter,), scene.profile)
     others = tuple(other for other in scene.loop.plant.faults if other.parameter != fault.parameter)
     F, i = fisher_matrix(scene), scene.names.index(fault.parameter)
-    found = []
+    closest = []
     for other in others:
         j = scene.names.index(other.parameter)
         guess = x * float(F[i, j] / max(F[j, j], 1e-300))
-        found.append(_closest_hypothesis(scene, window, other, own, guess))
-    left = np.array([residual for _, residual in found]).reshape(len(others), len(own))
-    return HypothesisDistances(others, (left**2).sum(axis=1), np.array([size for size, _ in found]), left)
+        closest.append(_closest_hypothesis(scene, window, other, own, guess))
+    left = np.array([residual for _, residual in closest]).reshape(len(others), len(own))
+    return HypothesisDistances(others, (left**2).sum(axis=1), np.array([size for size, _ in closest]), left)
 
 
 Span = tuple[float, float]

@@ -106,12 +106,12 @@ class Scenario:
     def size_grids(self) -> dict[str, dict[float, Predictor]]:
         """Predictors of each fault at sizes all over its range, by parameter and logarithm of the ratio."""
         window, nothing = self.healthy, np.zeros(self.healthy.nuisance_count)
-        found = {}
+        predictions = {}
         for fault in self.loop.plant.faults:
             sizes = np.linspace(np.log(fault.ratio_range[0]), np.log(fault.ratio_range[1]), GRID).tolist()
             name = (fault.parameter,)
-            found[name[0]] = {x: window.predictor(nothing, name, np.array([x]), self.profile) for x in sizes}
-        return found
+            predictions[name[0]] = {x: window.predictor(nothing, name, np.array([x]), self.profile) for x in sizes}
+        return predictions
 
     @cached_property
     def jacobian(self) -> FloatArray:

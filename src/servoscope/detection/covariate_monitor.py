@@ -49,7 +49,8 @@ class CovariateMonitor:
         self.model, self._theta, self._bank = model, np.array(baseline.theta), pipeline.bank
         self._covariance = baseline.covariance_array()
         self.average = CovariateAverage(len(model.names), pipeline.memory_samples)
-        self._hold = baseline.loop.monitor.covariate_hold_s * baseline.loop.sample_rate
+        # of a value without a new one, in samples
+        self.hold = baseline.loop.monitor.covariate_hold_s * baseline.loop.sample_rate
         self.size = self.average.size + len(model.names)
 
     def start(self) -> FloatArray:
@@ -72,7 +73,7 @@ class CovariateMonitor:
         of_average, age = np.split(state, [self.average.size])
         began, values = not np.isnan(of_average).any(), self.model.values(found)
         averages = self.average.run(of_average, values)
-        averages[self._ages(age, values) > self._hold] = np.nan
+        averages[self._ages(age, values) > self.hold] = np.nan
         known = np.flatnonzero(~np.isnan(averages).any(axis=1))
         if began or not known.size:
             return averages, None
@@ -89,7 +90,7 @@ class CovariateMonitor:
     def latest(self, state: FloatArray) -> FloatArray:
         """Return the averages in a state, shape (k,); NaN where the newest value is too old."""
         of_average, age = np.split(state, [self.average.size])
-        return np.where(age > self._hold, np.nan, self.average.latest(of_average))
+        return np.where(age > self.hold, np.nan, self.average.latest(of_average))
 
     def history(self, state: FloatArray) -> CovariateHistory:
         """Return the newest value of each covariate that is not too old."""
@@ -97,14 +98,14 @@ class CovariateMonitor:
         return {
             name: (np.zeros(1), last[j : j + 1])
             for j, name in enumerate(self.model.names)
-            if not np.isnan(last[j]) and age[j] <= self._hold
+            if not np.isnan(last[j]) and age[j] <= self.hold
         }
 
-    def compare(self, trace: Trace, averages: FloatArray) -> Trace:
-        """Return evaluations compared with what is healthy at averages of the covariates (K, k).
+    def expect(self, averages: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return how far healthy coefficients are moved, their further covariance, and where both are known.
 
-        One that is not measured comes with its standard deviation behind it, shape (K, 2). Where these are not known,
-        or outside of what was learned, none is ready.
+        Shapes (K, n), (K, n, n) and (K,). `averages` of the covariates, shape (K, k). One that is not measured comes
+        with its standard deviation behind it, shape (K, 2).
         """
         averages, std = np.split(averages, [len(self.model.names)], axis=1)
         known = np.isfinite(averages).all(axis=1) & self.model.is_inside(averages)
@@ -113,8 +114,16 @@ class CovariateMonitor:
         if std.size:
             off = self.model.theta(self._theta, c + np.where(known[:, None], std, 0.0)) - theta
             more = more + off[:, :, None] * off[:, None, :]
-        expected = trace.expected + theta - self._theta
-        C, healthy, ready = trace.covariance + more, trace.ifrf_expected, trace.ready & known
+        return theta - self._theta, more, known
+
+    def compare(self, trace: Trace, averages: FloatArray) -> Trace:
+        """Return evaluations compared with what is healthy at averages of the covariates, as `expect` takes them.
+
+        Where these are not known, or outside of what was learned, none is ready.
+        """
+        moved, more, known = self.expect(averages)
+        expected, C, healthy = trace.expected + moved, trace.covariance + more, trace.ifrf_expected
+        ready = trace.ready & known
         return replace(
             trace,
             expected=expected,

@@ -8,6 +8,7 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
+from servoscope.estimation.pipeline import Estimates, Pipeline
 from servoscope.signals import Recording
 
 MIN_MEMORIES = 3.0  # memories of the estimator before and after: either side is judged by itself
@@ -16,6 +17,7 @@ WHITE_RATIO = 252.0 / 70.0  # of white noise: variance of the differences of ord
 MIN_WHITE_SHARE = 0.8  # of that ratio, which a motion or a vibration does not have
 MIN_GROWTH = 2.0  # of the variance: less moves no estimate by as much as it scatters
 MIN_LOG_LIKELIHOOD_GAIN = 100.0  # of two variances against one; differences of white noise hang together for four
+MIN_NOISE_GROWTH = 1.5  # of the variance of the residual; below it counts as none
 MIN_OWN_GROWTH = 1.5  # of that of the whole signal: one that is scaled is another unit or gain
 MAX_SAMPLES = 2_000_000  # of a recording, which is looked at as a whole
 MAX_STDS = 4.0  # by which a step of u or an outlier counts
@@ -71,3 +73,14 @@ def _growth(name: str, x: FloatArray, recording: Recording, shortest: int) -> Lo
     ):
         return None
     return LouderNoise(name, onset + ORDER // 2, float(np.sqrt(after[at] / before[at])))
+
+
+def noise_growth(pipeline: Pipeline, estimates: Estimates) -> float:
+    """Return the growth of the noise's variance against the baseline's, 1 where it has not grown.
+
+    Noise shifts the expected estimate (errors in variables), so a failing sensor would look like a faulty plant. A low
+    quantile over time tells it from a fault, whose residual is large only until the estimate has followed.
+    """
+    settled = estimates.power[estimates.updates > 3.0 * pipeline.memory]
+    growth = float(np.quantile(settled, 0.1)) if len(settled) else 1.0
+    return growth if growth > MIN_NOISE_GROWTH else 1.0

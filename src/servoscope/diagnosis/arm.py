@@ -347,5 +347,6 @@ def _size(baseline: ArmBaseline, found: CauseEvidence) -> Message:
     fault = _fault(baseline, found)
     if kind in ("friction", "drive gain") and fault is not None:
         least, most = fault.interval
-        return message("arm.size_ratio", parameter=found.cause.parameter, ratio=fault.ratio, low=least, high=most)
+        parameter = found.cause.parameter.replace("_", " ")
+        return message("arm.size_ratio", parameter=parameter, ratio=fault.ratio, low=least, high=most)
     return message("arm.size", value=value, low=low, high=high, unit=UNITS[kind])

@@ -8,16 +8,20 @@ import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.expectation import Expectation, reference_path
+from servoscope.baseline.pressure_model import PIECE_S
+from servoscope.baseline.residual_model import ResidualModel
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError, RecordingError
 from servoscope.detection.onset import Onset
 from servoscope.diagnosis.examine import Examination
+from servoscope.diagnosis.pressure_evidence import pressure_inputs
 from servoscope.estimation.instrumental_fit import InstrumentalFit, fit_with_instrument
-from servoscope.estimation.tuning import fit_tuning
+from servoscope.estimation.tuning import fit_tuning, least_squares
 from servoscope.isolation.signature import Signature
 from servoscope.isolation.signatures import fault_signatures
 
 MAX_STRETCH_SAMPLES = 200_000  # of a stretch; more add nothing but memory
+MIN_SAMPLES_PER_COEFFICIENT = 20  # usable samples of a stretch
 HALF_STRETCH_TOLERANCE = 0.05  # stated relative deviation, up to which half a stretch is enough
 
 
@@ -84,6 +88,7 @@ def isolation_inputs(exam: Examination, onset: Onset, at: int) -> tuple[list[Sig
     Learned faults whose directions are close are separated better by the whole stretch since the onset than by the last
     memory of it, so a baseline that has some uses it; not where signatures are simulated, which are the recursion's.
     With a learned instrument it is used too: the recursion's is of the healthy plant, which large changes leave behind.
+    And so it is where healthy recordings show how such fits scatter: what no term explains repeats with the motion.
     """
     recording, e, last = exam.recording, exam.estimates, int(exam.estimates.index[at])
     first, whole = exam.memory_start(at), None
@@ -95,11 +100,42 @@ def isolation_inputs(exam: Examination, onset: Onset, at: int) -> tuple[list[Sig
         # where it is not enough, the recursion, which starts from healthy, needs no more than the alarm did
         with contextlib.suppress(NotEnoughError):
             whole = estimate_batch_deviation(exam, begin, float(recording.t[last]) + 0.5 / recording.sample_rate)
-    recursive = e.theta[at] - exam.expected[at], e.S[at] * max(1.0, float(e.power[at]))
+    known = exam.baseline.covariance_array()
+    recursive = e.theta[at] - exam.expected[at], e.S[at] * max(1.0, float(e.power[at])) + known
+    if whole is not None:
+        whole = whole[0], whole[1] + known
+    elif exam.pressures is not None:
+        begin = onset.sample // round(PIECE_S * recording.sample_rate)
+        return pressure_inputs(exam.pressures, exam.baseline.plant, begin)
+    elif (model := exam.baseline.residual) is not None and model.halves:
+        whole = _deviation_of_stretch(exam, model, onset, last)
     deviation, covariance = whole or recursive
     expectation = exam.expectation(first, last + 1) if exam.noise is not None else None
     recalled = recording.rows(slice(first, last + 1))
     settled = whole is not None
     signatures = fault_signatures(exam.baseline, recalled, expectation, max(onset.sample - first, 0), settled)
     model_error = exam.model_error(slice(at, at + 1))[0]
-    return signatures, deviation, covariance + exam.baseline.covariance_array() + model_error
+    return signatures, deviation, covariance + model_error
+
+
+def _deviation_of_stretch(
+    exam: Examination, model: ResidualModel, onset: Onset, last: int
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return theta since an onset minus its healthy expectation, (n,), and how such fits scatter, (n, n).
+
+    An onset that leaves less than a memory is hardly known: all of its interval counts then. None where the samples do
+    not tell the coefficients.
+    """
+    rate = exam.recording.sample_rate
+    first = onset.sample
+    if last - first < exam.pipeline.memory_samples:
+        first = round((onset.low_s - float(exam.recording.t[0])) * rate)
+    rows = slice(first, last + 1)
+    part = exam.recording.rows(rows)
+    g = exam.pipeline.regression(part.r, part.u, part.y, part.restart)
+    if g.ok.sum() < MIN_SAMPLES_PER_COEFFICIENT * g.phi.shape[1] or not g.phi[g.ok].any(axis=0).all():
+        return None
+    expected = np.array(exam.baseline.theta)
+    if exam.along is not None:
+        expected = exam.along.expected(np.arange(first, last + 1)[g.ok]).mean(axis=0)
+    return least_squares(g) - expected, model.stretch_covariance(float(g.ok.sum()))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -164,7 +164,7 @@ def _judge_signals(
         raise RecordingError(f"{recording.name}: {missing}")
     exams = [Examination.from_recording(one, recording) for one in points]
     if exams[0].along is not None and (outside := exams[0].along.outside) is not None:
-        return leave_undetermined(exams[0], outside), exams[0], None
+        return leave_undetermined(exams[0], outside).model_copy(update=_feature_change(exams[0])), exams[0], None
     hold_s, rate = baseline.loop.monitor.covariate_hold_s, recording.sample_rate
     if model is not None and (stale := model.describe_stale(recording.channels, hold_s, rate)) is not None:
         return leave_undetermined(exams[0], stale), exams[0], None
@@ -231,18 +231,14 @@ def diagnose_examination(
     verdict: Verdict = "fault"
     intervals: tuple[FaultInterval, ...] = ()
     onset: Onset | None = None
-    changed = features.changed if features is not None else None
     if alarm is not None:
         at = alarm.evaluation
         intervals, onset, doubts = _explain_alarm(exam, alarm, progress)
         verdict = "healthy" if is_repaired(exam, intervals) else verdict
         warnings = _all_warnings(exam, doubts + covariate_warnings(exam, at))
         headline = build_headline(verdict, intervals, {}, warnings, baseline.point)
-    elif features is not None and changed is not None:
-        unknown = (Candidate(name=UNKNOWN, probability=1.0),)
-        warnings = _all_warnings(exam, [])
-        intervals = (FaultInterval(detected_at_s=exam.features_changed_s, probability=1.0, candidates=unknown),)
-        headline = features.headline(changed, baseline.point)
+    elif change := _feature_change(exam):
+        headline, intervals, warnings = change["headline"], change["intervals"], _all_warnings(exam, [])
     else:
         verdict, headline, warnings = judge_without_alarm(exam)
     interval = next((one for one in intervals if _covers(one, float(exam.t(at)))), intervals[-1] if intervals else None)
@@ -250,7 +246,7 @@ def diagnose_examination(
     end = corrected_trace(exam, correction, slice(max(last, 0), last + 1))
     explained = end if at == last else corrected_trace(exam, correction, slice(at, at + 1))
     reasons = build_reasons(exam, explained, interval) if alarm is not None and interval is not None else ()
-    if features is not None and changed is not None:
+    if features is not None and (changed := features.changed) is not None:
         reasons = (*reasons, *features.reasons(changed, alone=alarm is None))
     diagnosis = Diagnosis(
         **recording_facts(recording),
@@ -265,6 +261,21 @@ def diagnose_examination(
         point=baseline.point or None,
     )
     return diagnosis, correction
+
+
+def _feature_change(exam: Examination) -> dict[str, Any]:
+    """Return what a diagnosis says of features that changed; their limits widen beyond the learned covariates."""
+    features, changed = exam.features, exam.features.changed if exam.features is not None else None
+    if features is None or changed is None:
+        return {}
+    unknown = (Candidate(name=UNKNOWN, probability=1.0),)
+    interval = FaultInterval(detected_at_s=exam.features_changed_s, probability=1.0, candidates=unknown)
+    return {
+        "verdict": "fault",
+        "headline": features.headline(changed, exam.baseline.point),
+        "reasons": features.reasons(changed, alone=True),
+        "intervals": (interval,),
+    }
 
 
 def judge_without_alarm(exam: Examination) -> tuple[Verdict, Message, list[DiagnosisWarning]]:

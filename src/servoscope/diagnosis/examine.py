@@ -14,17 +14,18 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.covariates import CovariatePath
 from servoscope.baseline.expectation import Expectation, ReferencePath, reference_path, residual_noise_model
 from servoscope.baseline.motion import RecordedMotion
+from servoscope.baseline.pressure_model import PressureEvidence
 from servoscope.core import outofcore
-from servoscope.core.arrays import FloatArray
+from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import RecordingError
 from servoscope.detection import cusum_design
 from servoscope.detection.baseline_run import BaselineRun, baseline_run, cusum_constants
+from servoscope.detection.louder_noise import noise_growth
 from servoscope.detection.statistic import apply_alarm_delays, t2_statistic
 from servoscope.detection.trace import UNSEEN_EXCESS, Statistic, any_exceeded, detection_statistics
 from servoscope.detection.warm_up import follow_warm_up
@@ -34,12 +35,11 @@ from servoscope.estimation.pipeline import Estimates, EstimationRunner, Pipeline
 from servoscope.isolation.ml.axis_scan import AxisChange
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
-from servoscope.simulation import closed_loop_poles
+from servoscope.simulation.stability import settling_samples
 
 MAX_SKIPPED_SHARE = 0.2  # share of updates that an estimator's guard may skip before the AKF takes over
 MIN_INSTRUMENT_EIGENVALUE = 0.05  # of 1; below, the recursion follows too slowly, and below 0 it runs away
 FALL_BACK = {"estimator": "akf"}
-MIN_NOISE_GROWTH = 1.5  # of the variance; below it counts as none
 MAX_COVARIATE_T2 = 1.0  # T^2 of what covariates do within a recording, from which on no single plant explains it
 AT_ONCE = 4096  # evaluations
 FORGOTTEN_SHARE = 1e-9  # share of the past below which it counts as forgotten
@@ -60,7 +60,7 @@ class Examination:
     statistic: FloatArray  # T^2, shape (K,)
     skipped_share: float  # share of the updates that the estimator's guard skipped
     noise_growth: float  # of the noise's variance against the baseline's
-    change: AxisChange | None = None  # within the recording, where it is one of a motor axis
+    apparent_change: AxisChange | None = None  # within the recording, where it is one of a motor axis
     along: CovariatePath | None = None  # what covariates make of the coefficients; None where none were learned
     replaced: bool = False  # whether the instrument of the nominal loop failed and the AKF took over
     quick: bool = False  # whether features are left out: of assets that are monitored, the monitor follows them
@@ -71,7 +71,6 @@ class Examination:
 
         `quick`: whether features and residual are left out, and the sequential test may be held against the baseline's
         own limits where neither these nor those for the recording's reference, which take far longer, raise an alarm.
-
         Raises RecordingError if the recording's sample rate is not the loop's.
         """
         loop = baseline.loop
@@ -82,8 +81,7 @@ class Examination:
             )
         along, pipeline = None, baseline.pipeline()
         if (model := baseline.covariates) is not None:
-            memory = pipeline.memory_samples
-            theta = np.array(baseline.theta)
+            memory, theta = pipeline.memory_samples, np.array(baseline.theta)
             if model.warm_up is None:
                 along = CovariatePath.of(model, theta, recording.channels, memory)
             else:
@@ -91,19 +89,18 @@ class Examination:
             place = ", ".join(filter(None, [baseline.point, along.place]))
             # features are compared at the covariates of each span, and an axis at those of each sample
             moves = baseline.axis is not None and baseline.axis.moves is not None
-            kept = "features", "residual", *(["axis"] if moves else [])
+            kept = "features", "residual", "pressures", *(["axis"] if moves else [])
             followed: dict[str, Any] = {"point": place, **{name: getattr(baseline, name) for name in kept}}
             baseline = baseline.at(dict(zip(model.names, along.averages[-1].tolist(), strict=True)))
             baseline = baseline.model_copy(update=followed)
         exam = _run_quickly(baseline, recording) if quick and along is None else None
         exam = exam or _run_recursion(baseline, recording, pipeline, along)
-        skipped = exam.estimates.skipped_share
-        replaced = _has_failed_instrument(exam)
+        skipped, replaced = exam.estimates.skipped_share, _has_failed_instrument(exam)
         if replaced or skipped > MAX_SKIPPED_SHARE:
             other = loop.model_copy(update={"monitor": loop.monitor.model_copy(update=FALL_BACK)})
             pipeline = Pipeline.of(other, baseline.recursion.stage_one, baseline.recursion.still_speed)
             exam = _run_recursion(baseline, recording, pipeline, along)
-        growth = 1.0 if exam.noise is None else _noise_growth(exam.pipeline, exam.estimates)
+        growth = 1.0 if exam.noise is None else noise_growth(exam.pipeline, exam.estimates)
         if growth > 1.0:  # it shifts the expectation, and the sequential test would take it for steps of a change
             exam = _run_recursion(baseline, recording, exam.pipeline, along, growth)
         change, exam = None, exam if along is None else replace(exam, along=along)
@@ -111,7 +108,7 @@ class Examination:
             from servoscope.isolation.ml.axis_scan import find_axis_change
 
             change = find_axis_change(baseline, recording)
-        return replace(exam, skipped_share=skipped, replaced=replaced, change=change, quick=quick)
+        return replace(exam, skipped_share=skipped, replaced=replaced, apparent_change=change, quick=quick)
 
     @cached_property
     def drifts(self) -> bool:
@@ -144,7 +141,7 @@ class Examination:
         return np.asarray(self.noise_growth * self.estimates.S[at] + known)
 
     @property
-    def ready(self) -> npt.NDArray[np.bool_]:
+    def ready(self) -> BoolArray:
         """Whether the estimator had learned anything by then, shape (K,)."""
         return self.estimates.updates > 0
 
@@ -167,6 +164,12 @@ class Examination:
         model = None if self.quick else self.baseline.residual
         return np.full(2, np.nan) if model is None else model.ratios_of(self.pipeline, self.recording)
 
+    @cached_property
+    def pressures(self) -> PressureEvidence | None:
+        """What logged pressures show; None where none were learned or logged, or it is `quick`."""
+        model = None if self.quick else self.baseline.pressures
+        return None if model is None else model.evidence(self.recording)
+
     @property
     def features_changed_s(self) -> float | None:
         """End of the span with which the features left their limit [s]; None where they did not."""
@@ -174,22 +177,31 @@ class Examination:
         return None if span is None else float(self.recording.t[span.end - 1])
 
     @cached_property
-    def apparent_alarm(self) -> npt.NDArray[np.bool_]:
+    def apparent_alarm(self) -> BoolArray:
         """Whether a statistic of the coefficients was above its limit, after the delays, shape (K,)."""
-        return self._changed | apply_alarm_delays(any_exceeded(self.statistics[:2]), *self.pipeline.delays)
+        changed = self._changed(self.apparent_change)
+        return changed | apply_alarm_delays(any_exceeded(self.statistics[:2]), *self.pipeline.delays)
 
-    @property
-    def _changed(self) -> npt.NDArray[np.bool_]:
-        """Whether a change within the recording had been detected, or was not yet repaired, shape (K,)."""
-        change, index = self.change, self.estimates.index
+    @cached_property
+    def change(self) -> AxisChange | None:
+        """The change within the recording; None where a motion never seen may explain it: its limit knows none."""
+        if (change := self.apparent_change) is None:
+            return None
+        at = min(int(np.searchsorted(self.estimates.index, change.detected)), self.evaluations - 1)
+        return None if (self.motion_excess(slice(at, at + 1)) >= UNSEEN_EXCESS).any() else change
+
+    def _changed(self, change: AxisChange | None) -> BoolArray:
+        """Return whether a change within the recording had been detected, or was not yet repaired, shape (K,)."""
+        index = self.estimates.index
         if change is None:  # what is left of u speaks of the whole recording
-            return np.asarray((index == index[-1:].sum()) & (self.residual_ratios > 1.0).any())
+            off = (self.residual_ratios > 1.0).any() or (self.pressures is not None and self.pressures.excess > 1.0)
+            return np.asarray((index == index[-1:].sum()) & off)
         if change.repaired:
             return np.asarray(index < change.onset)
         return np.asarray(index >= index[-1:].min(initial=change.detected))  # or detected after the last evaluation
 
     @cached_property
-    def alarm(self) -> npt.NDArray[np.bool_]:
+    def alarm(self) -> BoolArray:
         """Whether there was an alarm of the coefficients that a motion never seen does not explain, shape (K,)."""
         if not self.apparent_alarm.any() or self.motion is None:  # in this order: the motion takes a second reading
             return self.apparent_alarm
@@ -202,7 +214,7 @@ class Examination:
             exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & (self.motion_excess(at) < UNSEEN_EXCESS))
         exceeded &= any_exceeded(self.statistics[:2])
         self.release()
-        return self._changed | apply_alarm_delays(exceeded, *self.pipeline.delays)
+        return self._changed(self.change) | apply_alarm_delays(exceeded, *self.pipeline.delays)
 
     @cached_property
     def motion(self) -> RecordedMotion | None:
@@ -231,8 +243,9 @@ class Examination:
         """
         pipeline, tuning = self.pipeline, self.tuning
         end, period = (at + 1) * pipeline.every, int(np.lcm(pipeline.every, pipeline.stride))
-        settling = pipeline.bank.wait + (_settling(pipeline, self.baseline.plant) if self.noise is not None else 0)
-        memories = MEMORIES
+        settling, memories = pipeline.bank.wait, MEMORIES
+        if self.noise is not None:
+            settling += settling_samples(pipeline.loop, self.baseline.plant, FORGOTTEN_SHARE)
         while True:
             learning = end - round(memories * pipeline.memory * pipeline.stride)
             first = (learning - settling) // period * period
@@ -286,16 +299,9 @@ class Examination:
         return found
 
 
-def _settling(pipeline: Pipeline, plant: Plant) -> int:
-    """Return how many samples a loop takes to forget its initial state."""
-    slowest = float(np.abs(closed_loop_poles(pipeline.loop, plant)).max())
-    return int(np.ceil(np.log(FORGOTTEN_SHARE) / np.log(slowest))) if 0.0 < slowest < 1.0 else 0
-
-
 def _reference_piece(recording: Recording, rows: slice, first: int) -> ReferencePath:
     """Return the reference of a chunk; the run began at sample `first`."""
-    before = rows.start - 1
-    ahead = (float(recording.t[before]), float(recording.r[before])) if rows.start > first else None
+    ahead = (float(recording.t[rows.start - 1]), float(recording.r[rows.start - 1])) if rows.start > first else None
     return reference_path(recording.rows(rows), ahead)
 
 
@@ -319,9 +325,8 @@ def _run_recursion(
 
     `run`: with the baseline's own sequential test; None: with limits for the recording's reference.
     """
-    tuning, noise, walk, watch = baseline.tuning, None, None, None
-    if baseline.healthy.noise is not None:
-        noise = baseline.healthy.noise.times(np.sqrt(growth))
+    tuning, noise, walk, watch = baseline.tuning, baseline.healthy.noise, None, None
+    noise = None if noise is None else noise.times(np.sqrt(growth))
     if run is not None:
         walk = None if run.mean is None else run.mean.again()
     elif noise is None:
@@ -335,9 +340,8 @@ def _run_recursion(
     def healthy(rows: slice) -> FloatArray:
         if walk is None:
             return tuning.theta
-        return np.asarray(
-            walk.advance(_reference_piece(recording, rows, 0)) + (tuning.theta - np.array(baseline.healthy.theta))
-        )
+        piece = _reference_piece(recording, rows, 0)
+        return np.asarray(walk.advance(piece) + (tuning.theta - np.array(baseline.healthy.theta)))
 
     started = tuning if along is None else replace(tuning, theta=along.start)
     estimating = EstimationRunner(pipeline, started, watch) if run is None else run.estimates.again()
@@ -363,21 +367,9 @@ def _run_recursion(
             outofcore.release(*recording.columns)
         if kept is not None:
             kept.result()
-    found = {name: column.to_array() for name, column in columns.items()}
-    expected, T2 = found.pop("expected"), found.pop("statistic")
-    estimates = Estimates(**found)
-    return Examination(baseline, recording, pipeline, tuning, estimates, noise, expected, T2, 0.0, growth)
-
-
-def _noise_growth(pipeline: Pipeline, estimates: Estimates) -> float:
-    """Return the growth of the noise's variance against the baseline's, 1 where it has not grown.
-
-    Noise shifts the expected estimate (errors in variables), so a failing sensor would look like a faulty plant. A low
-    quantile over time tells it from a fault, whose residual is large only until the estimate has followed.
-    """
-    settled = estimates.power[estimates.updates > 3.0 * pipeline.memory]
-    growth = float(np.quantile(settled, 0.1)) if len(settled) else 1.0
-    return growth if growth > MIN_NOISE_GROWTH else 1.0
+    arrays = {name: column.to_array() for name, column in columns.items()}
+    expected, T2 = arrays.pop("expected"), arrays.pop("statistic")
+    return Examination(baseline, recording, pipeline, tuning, Estimates(**arrays), noise, expected, T2, 0.0, growth)
 
 
 def _has_failed_instrument(exam: Examination) -> bool:
@@ -395,6 +387,5 @@ def _has_failed_instrument(exam: Examination) -> bool:
         g = runner.advance(part.r, part.u, part.y, part.restart)
         z, phi = g.z[g.ok] / scale, g.phi[g.ok] / scale
         own, shared = own + z.T @ z, shared + z.T @ phi
-    if not own.any():
-        return False
-    return bool(np.linalg.eigvals(np.linalg.lstsq(own, shared, rcond=None)[0]).real.min() < MIN_INSTRUMENT_EIGENVALUE)
+    moved = np.linalg.lstsq(own, shared, rcond=None)[0]
+    return bool(own.any() and np.linalg.eigvals(moved).real.min() < MIN_INSTRUMENT_EIGENVALUE)

@@ -202,6 +202,8 @@ def _alarm_reason(exam: Examination, interval: FaultInterval) -> Message | None:
     first = min(int(np.searchsorted(exam.estimates.index, sample)), exam.evaluations - 1)
     if exam.estimates.level[first] >= 1.0:
         return message("diagnosis.alarm_cusum", t=interval.detected_at_s)
+    if exam.pressures is not None and exam.pressures.excess > 1.0:
+        return message("diagnosis.alarm_pressures", excess=exam.pressures.excess)
     value, limit = float(exam.statistic[first]), exam.baseline.thresholds.statistic
     if value <= limit:  # then the other tests alone may have raised it
         excess = float(np.nanmax(exam.residual_ratios, initial=0.0))

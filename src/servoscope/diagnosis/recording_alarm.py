@@ -10,6 +10,7 @@ import numpy as np
 from servoscope.detection.onset import Onset, estimate_onset
 from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.output_onset import refine_onset
+from servoscope.diagnosis.pressure_evidence import pressure_onset
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,8 @@ def first_alarm(exam: Examination, progress: Callable[[str], None] = lambda _: N
     if change is not None:
         low, likely, high = (float(exam.recording.t[k]) for k in change.onset_interval)
         return RecordingAlarm(change.detected, at, Onset(low, likely, high, change.onset))
+    if exam.pressures is not None and exam.pressures.excess > 1.0:
+        return RecordingAlarm(sample, at, pressure_onset(exam.pressures, exam.recording))
     onset = estimate_onset(
         exam.pipeline,
         exam.recording,

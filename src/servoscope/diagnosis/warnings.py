@@ -46,6 +46,10 @@ def detectable_sizes(exam: Examination) -> dict[str, tuple[float, float]]:
     smallest = {
         name: float(np.sqrt(needed / one)) if one > 0.0 else np.inf for name, one in zip(promised, best, strict=True)
     }
+    if exam.pressures is not None:
+        for name, size in exam.pressures.model.detectable_changes.items():
+            if name in smallest:
+                smallest[name] = min(smallest[name], size)
     if exam.along is not None and exam.along.std is not None:
         for name, per_warmth in changes_like_warmth(exam).items():
             smallest[name] = max(smallest.get(name, 0.0), exam.along.jump * per_warmth)

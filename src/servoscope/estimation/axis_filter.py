@@ -53,7 +53,7 @@ class DriveLag(NamedTuple):
         k = np.arange(len(u))
         begin = np.maximum.accumulate(np.where(restart, k, 0))
         whole, part = divmod(self.delay_s * sample_rate, 1.0)
-        at = (np.clip(k - int(whole) - more, begin, len(u) - 1) for more in (0, 1))
+        at = (np.clip(k - int(whole) - extra, begin, len(u) - 1) for extra in (0, 1))
         sooner, later = (u[np.where(begin[i] > begin, k, i)] for i in at)  # no run reaches into the next one
         u = (1.0 - part) * sooner + part * later
         if self.lag_s * sample_rate < MIN_LAG_SAMPLES:
@@ -118,7 +118,7 @@ class AxisFilter:
         settling = int(np.ceil(np.log(MAX_REMAINING_SHARE) / np.log(min(max(slowest, 0.01), 0.999))))
         # kernels take three poles, of which that of a position may be missing
         to_acceleration, to_y, poles = (
-            np.pad(one, (0, derivative)) for one in (numerator[0], poles - from_y[0], poles)
+            np.pad(polynomial, (0, derivative)) for polynomial in (numerator[0], poles - from_y[0], poles)
         )
         return cls(to_acceleration, to_y, poles, S, settling)
 

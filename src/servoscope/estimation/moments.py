@@ -36,9 +36,9 @@ def propagate_covariance(c: Any, model: int, s: Any, at: int, lags: int, phi: Se
     for k in range(lags):
         here, a = to_M + k * n, c[model + 1 + k]
         column = [fma(a, m[i], s[here + n + i]) if k < lags - 1 else a * m[i] for i in range(n)]
-        rest = c[model + 1 + lags + k] - dot(phi, column)
+        remainder = c[model + 1 + lags + k] - dot(phi, column)
         for i in range(n):
-            s[here + i] = fma(K[i], rest, column[i])
+            s[here + i] = fma(K[i], remainder, column[i])
 
 
 def propagate_initial_share(s: Any, at: int, phi: Sequence[Any], K: Sequence[Any]) -> None:
@@ -83,10 +83,10 @@ def whiten_each(printer: Any, covariance: Any, deviation: Any, L: Any, out: Any)
                 with printer.when(j < i):
                     L[i, j] = left.value / L[j, j]
             for c in printer.loop(0, m):
-                rest = Variable(printer, deviation[k, i, c] / size(i))
+                remainder = Variable(printer, deviation[k, i, c] / size(i))
                 for l in printer.loop(0, i):
-                    rest.value = rest.value - L[i, l] * out[k, l, c]
-                out[k, i, c] = rest.value / L[i, i]
+                    remainder.value = remainder.value - L[i, l] * out[k, l, c]
+                out[k, i, c] = remainder.value / L[i, i]
     return 1 - failures.value
 
 

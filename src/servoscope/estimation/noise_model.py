@@ -176,7 +176,7 @@ def arma_from_system(system: LinearSystem, stride: int) -> ArmaNoise:
     unit = scaled.output(np.array([[float(gamma[0]) ** -0.5]]))
     A, Q, S, R = decimate_noise(unit, stride)
     K, variance = innovation_gain(A, unit.C, Q, S, R)
-    poles, zeros = _cancel_pairs(*(np.linalg.eigvals(each).astype(np.complex128) for each in (A, A - K @ unit.C)))
+    poles, zeros = _cancel_pairs(*(np.linalg.eigvals(matrix).astype(np.complex128) for matrix in (A, A - K @ unit.C)))
     order = max(len(poles), 1)
     a, b = (np.pad(np.real(np.poly(roots))[1:], (0, order - len(roots))) for roots in (poles, zeros))
     # the autocovariance of what is left: with that of the whole system a recursion would lose its positive covariance
@@ -222,8 +222,8 @@ def _spectra(system: LinearSystem, stride: int, samples: int) -> FloatArray:
     memory = np.log(RESPONSE_TAIL) / np.log(slowest) if 0.0 < slowest < 1.0 else 1.0
     lags = int(min(max(64, memory), max(samples // 2, 1)))
     columns = []
-    for one in np.eye(system.B.shape[1]):
-        gamma = autocovariances(system.input(one[:, None]), lags, stride)[:, 0, 0]
+    for unit in np.eye(system.B.shape[1]):
+        gamma = autocovariances(system.input(unit[:, None]), lags, stride)[:, 0, 0]
         whole = np.zeros(samples)
         whole[: lags + 1] += gamma
         whole[samples - lags :] += gamma[:0:-1]

@@ -47,6 +47,16 @@ class Regression:
     z: FloatArray
     ok: BoolArray  # whether the sample may update an estimator, shape (N,)
 
+    @property
+    def halves(self) -> tuple[Regression, Regression]:
+        """The first and the second half of the samples."""
+        middle = len(self.eta) // 2
+        return self.rows(slice(middle)), self.rows(slice(middle, None))
+
+    def rows(self, rows: slice) -> Regression:
+        """Return some of the samples."""
+        return Regression(self.eta[rows], self.phi[rows], self.z[rows], self.ok[rows])
+
 
 @dataclass(frozen=True, eq=False)
 class Estimates:
@@ -233,8 +243,8 @@ class Pipeline:
         if not integer_delay(self.loop):
             return self.bank.system
         instrument = instrument_model(self.loop, self.instrument) if self.bank.has_instrument else None
-        rest = self.loop.model_copy(update={"delay": self.loop.delay - integer_delay(self.loop)})
-        return filter_bank.build_filter_bank(rest, instrument).system
+        inner = self.loop.model_copy(update={"delay": self.loop.delay - integer_delay(self.loop)})
+        return filter_bank.build_filter_bank(inner, instrument).system
 
     def flow(self, u: FloatArray, y: FloatArray, restart: BoolArray) -> FloatArray:
         """Return the flow of the valve, shape (N,); u itself where its law is linear."""
@@ -317,9 +327,9 @@ def _transform_rows(rows: FloatArray, matrix: _Elements) -> FloatArray:
     """Return a matrix (p, m) times each of K rows, shape (K, p); a row's bits do not depend on the others."""
     from servoscope.estimation.moments import add_products  # late: loads numba
 
-    found = np.zeros((matrix.p, len(rows)))
-    add_products(*matrix[1:], np.ascontiguousarray(rows.T, dtype=np.float64), found)
-    return np.ascontiguousarray(found.T)
+    transformed = np.zeros((matrix.p, len(rows)))
+    add_products(*matrix[1:], np.ascontiguousarray(rows.T, dtype=np.float64), transformed)
+    return np.ascontiguousarray(transformed.T)
 
 
 class RegressionRunner:

@@ -274,8 +274,8 @@ def compile_stage_one(estimator: str, pattern: sparse_lti.SparsityPattern) -> Ca
                 apply(update_general, theta, phi, weights.behind(n), P_d, u, private)
 
     for i in p.loop(0, size):
-        for each in (phi, theta, K):
-            each.store(i, p.constant(0.0, "double"))
+        for row in (phi, theta, K):
+            row.store(i, p.constant(0.0, "double"))
     for i in p.loop(0, n):
         theta.store(i, weights.load(i))
     for k in p.loop(0, p.argument("samples")):

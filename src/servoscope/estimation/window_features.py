@@ -8,27 +8,21 @@ or stream may be cut anywhere.
 
 from __future__ import annotations
 
-import functools
 import itertools
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
+from servoscope.estimation.window_state import HEADER, ROW_HEADER
 
 MOTIONS = ("forward", "backward", "rest")
 SIGNALS = ("u", "e")
-MAX_PHYSICAL = 1e100  # as in the recursion: no physical signal, and it would stay in the filters for ever
 SPEED_TIME = 0.02  # s: time constant behind the speed of the reference
 MIN_POSITIVE = np.finfo(np.float64).tiny
 MIN_MOTION_SAMPLES = 3  # samples of a motion from which a window speaks for it
-HEADER = 8  # numbers of the state before those of the filters; see `_accumulate`
-ROW_HEADER = 3  # numbers of a row before the sums: sample, level, span
-
-
-_pass_bands: Any = None  # filled in where the kernel is compiled
 
 
 class FeatureLayout(BaseModel):
@@ -110,7 +104,8 @@ class WindowFeatures:
         edges = np.array(layout.edges_s, dtype=np.float64) * layout.sample_rate
         counts = [layout.window, layout.levels, layout.span, layout.settling, edges.size, b.size]
         numbers = [layout.rest_speed, layout.sample_rate, float(smoothing)]
-        self.constants = np.concatenate([counts, numbers, edges, b, a[:, 0], a[:, 1]])  # as `_accumulate` takes them
+        # as `accumulate_windows` takes them
+        self.constants = np.concatenate([counts, numbers, edges, b, a[:, 0], a[:, 1]])
         bins, powers = 3 * layout.bins, 3 * layout.bins + 2 * len(MOTIONS) * layout.bands
         self._parts = slice(layout.bins), slice(layout.bins, bins), slice(bins, powers), slice(powers, None)
         self._floors = np.array(layout.floors)[:, None, None]
@@ -130,7 +125,7 @@ class WindowFeatures:
             yield window
 
     def window(self, row: FloatArray) -> Window:
-        """Return the window of a row that `_accumulate` has written."""
+        """Return the window of a row that `accumulate_windows` has written."""
         end, level, span = (int(x) for x in row[:ROW_HEADER])
         return Window(end, level, span, *self._features(row[ROW_HEADER : ROW_HEADER + self.layout.sums]))
 
@@ -170,132 +165,11 @@ class WindowLanes:
         self, rows: FloatArray, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray
     ) -> Iterator[tuple[int, Window]]:
         """Feed a block, each of shape (assets, N); change the rows; yield asset and window, asset by asset."""
+        from servoscope.estimation.window_kernel import accumulate_windows  # late: it imports Numba
+
         most = len(rows) * self._levels * (r.shape[1] // self._shortest + 1)
         out, lane = np.empty((most, ROW_HEADER + self._sums)), np.empty(most, dtype=np.int64)
-        found = _compile()(self._table, rows, self._begins, r, u, y, restart, out, lane)
-        for asset, row in zip(lane[:found].tolist(), out, strict=False):
-            if (one := self._assets[asset]) is not None:
-                yield asset, one.window(row)
-
-
-@functools.cache
-def _compile() -> Callable[..., int]:
-    from servoscope.core.jit.loops import kernel  # late: it imports Numba
-
-    return kernel(_accumulate)
-
-
-def _accumulate(
-    table: FloatArray,
-    states: FloatArray,
-    begins: IntArray,
-    R: FloatArray,
-    U: FloatArray,
-    Y: FloatArray,
-    restarts: BoolArray,
-    out: FloatArray,
-    lane: IntArray,
-) -> int:
-    # a row of constants: window, levels, span, settling, number of edges, number of bands, speed of rest, rate,
-    # smoothing; then edges [samples], b and both a of the band-pass filters
-    # a state: armed, sample, samples of the window, windows of the span, span, reference before, speed, 4 times the
-    # samples since the motion began plus the motion; then filters, then sums level by level
-    rows, lanes = 0, 2 * int(table[:, 5].max())
-    weights, filters, square = np.zeros((4, lanes)), np.zeros((4, lanes)), np.zeros((4, lanes))
-    for asset in range(len(table)):
-        c, s = table[asset], states[asset, begins[asset] :]
-        r, u, y, restart = R[asset], U[asset], Y[asset], restarts[asset]
-        window, levels, span, settling, edges, bands = c[0], int(c[1]), c[2], c[3], int(c[4]), int(c[5])
-        if bands == 0:
-            continue
-        rest, rate, smoothing = c[6], c[7], c[8]
-        bins, begin = 3 * (edges + 1), HEADER + 8 * bands
-        sums, powers = 3 * bins + 3 * (2 * bands + 1), begin + 1 + 3 * bins
-        for i in range(2 * bands):
-            j, band = i // bands, i % bands
-            weights[3, i] = 1.0 - j
-            for row in range(3):
-                weights[row, i] = c[9 + edges + row * bands + band]
-                square[row, i] = s[powers + (3 * j + row) * bands + band]
-            for row in range(4):
-                filters[row, i] = s[HEADER + 4 * (2 * band + j) + row]
-        armed, sample, speed, before, moving = s[0], s[1], s[6], s[5], int(s[7])
-        for k in range(len(r)):
-            sample += 1.0
-            if not (abs(r[k]) < MAX_PHYSICAL and abs(u[k]) < MAX_PHYSICAL and abs(y[k]) < MAX_PHYSICAL):
-                armed = 0.0
-                continue
-            if restart[k] or armed == 0.0:
-                armed, before, speed, moving, s[2] = 1.0, r[k], 0.0, 0, 0.0
-                # a band-pass has forgotten a constant: it starts where a signal has always been what it is now
-                for i in range(2 * bands):
-                    filters[0, i] = filters[1, i] = -weights[0, i] * (u[k] if i < bands else r[k] - y[k])
-                    filters[2, i] = filters[3, i] = 0.0
-                square[:] = 0.0
-                s[begin : begin + levels * (1 + sums)] = 0.0
-            speed += smoothing * ((r[k] - before) * rate - speed)
-            before = r[k]
-            motion = 2
-            if speed > rest:
-                motion = 0
-            elif speed < -rest:
-                motion = 1
-            moving = moving + 4 if moving & 3 == motion else motion
-            since, place = float(moving >> 2), motion * (edges + 1)
-            for edge in range(edges):
-                if since >= c[9 + edge]:
-                    place += 1
-            settled = sample > settling
-            row, error = motion if settled else 3, r[k] - y[k]
-            for i in range(lanes):  # u or e, twice through a band-pass
-                b, a, a_last = weights[0, i], weights[1, i], weights[2, i]
-                value = u[k] if weights[3, i] > 0.0 else error
-                first = b * value + filters[0, i]
-                filters[0, i] = filters[1, i] - a * first
-                filters[1, i] = -b * value - a_last * first
-                passed = b * first + filters[2, i]
-                filters[2, i] = filters[3, i] - a * passed
-                filters[3, i] = -b * first - a_last * passed
-                square[row, i] += passed * passed
-            if not settled:
-                continue
-            s[begin + 1 + bins + place] += u[k]
-            s[begin + 1 + 2 * bins + place] += r[k] - y[k]
-            s[begin + 1 + place] += 1.0
-            s[powers + 6 * bands + motion] += speed * speed
-            s[2] += 1.0
-            if s[2] < window:
-                continue
-            s[2] = 0.0
-            s[3] += 1.0
-            for i in range(2 * bands):
-                for row in range(3):
-                    s[powers + (3 * (i // bands) + row) * bands + i % bands] = square[row, i]
-            square[:] = 0.0
-            for level in range(levels):
-                at = begin + level * (1 + sums)
-                if level:
-                    for i in range(sums):
-                        s[at + 1 + i] += s[begin + 1 + i]
-                s[at] += 1.0
-                if s[at] >= 2**level:
-                    lane[rows], out[rows, 0], out[rows, 1], out[rows, 2] = asset, sample, level, s[4]
-                    for i in range(sums):
-                        out[rows, ROW_HEADER + i] = s[at + 1 + i]
-                    rows += 1
-                    if level:
-                        for i in range(sums + 1):
-                            s[at + i] = 0.0
-            for i in range(sums + 1):
-                s[begin + i] = 0.0
-            if s[3] >= span:
-                s[3] = 0.0
-                s[4] += 1.0
-                s[begin : begin + levels * (1 + sums)] = 0.0
-        for i in range(2 * bands):
-            for row in range(3):
-                s[powers + (3 * (i // bands) + row) * bands + i % bands] = square[row, i]
-            for row in range(4):
-                s[HEADER + 4 * (2 * (i % bands) + i // bands) + row] = filters[row, i]
-        s[0], s[1], s[5], s[6], s[7] = armed, sample, before, speed, moving
-    return rows
+        count = accumulate_windows(self._table, rows, self._begins, r, u, y, restart, out, lane)
+        for asset, row in zip(lane[:count].tolist(), out, strict=False):
+            if (features := self._assets[asset]) is not None:
+                yield asset, features.window(row)

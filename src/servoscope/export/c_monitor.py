@@ -16,6 +16,7 @@ from servoscope.core.jit.c_source import c_literal
 from servoscope.estimation.kernel.sample_steps import HEADER_SIZE
 from servoscope.estimation.kernel.spec import KernelSpec
 from servoscope.export.constants import ExportConstants, check_name, common_words, plain_text
+from servoscope.export.covariates import covariate_words
 from servoscope.export.golden import GoldenRun, golden_text
 from servoscope.export.image import pack_image
 from servoscope.export.precision import describe_rounding
@@ -27,6 +28,7 @@ __all__ = ["UNSEEN_MOTION", "CMonitor", "export_c"]
 
 NAME = "servo_monitor"
 MAX_LINE = 108
+COVARIATE_TEMPLATES = "covariates", "covariates_interface"
 SIGNAL_BYTES = 2 * 4 + 4 * 4 + 3 * 8 + 8 * (3 + 3 + 1 + 16 + 4 * 2)  # of the struct `signals` in monitor.h
 UNSEEN_MOTION = (
     "Under motions that the healthy recordings do not hold an alarm may be no fault: the server looks at that."
@@ -86,16 +88,17 @@ def export_c(
     """
     check_name(name)
     made = ExportConstants.from_baseline(baseline, only_coefficients, single)
-    golden = GoldenRun.from_baseline(baseline, made.recursion, baseline.thresholds.statistic, made.delays)
+    golden = GoldenRun.from_baseline(made)
     values = common_words(made, name) | _number_words(single) | _sizes(made, single) | _code(made, name, single)
-    values |= _frozen_words(made)
+    values |= _frozen_words(made) | covariate_words(made, name, values)
+    values |= {text: fill_template(f"{text}.c", values) if made.covariates else "" for text in COVARIATE_TEMPLATES}
     values["frozen_functions"] = fill_template("frozen.c", values)
     values |= {
         "left_out": _left_out(baseline, only_coefficients),
         "rounding": describe_rounding(made, only_coefficients, golden) if single else "",
     }
     named = {"monitor.c": f"{name}.c", "monitor.h": f"{name}.h", "check.c": "check.c", "Makefile": "Makefile"}
-    texts = {each: fill_template(template, values) for template, each in named.items()}
+    texts = {file: fill_template(template, values) for template, file in named.items()}
     image = pack_image(made.mark, golden.state, *golden.alarm)
     texts[f"{name}_golden.h"] = golden_text(golden, name, image)
     return CMonitor(texts, made.mark, values["state_bytes"], values["constant_bytes"], SIGNAL_BYTES)
@@ -120,11 +123,11 @@ def _sizes(made: ExportConstants, single: bool) -> dict[str, Any]:
         "rate": c_literal(made.baseline.loop.sample_rate),
         "n": size.n,
         "frequencies": F,
-        "size": made.recursion.size,
+        "size": len(made.start),
         "row": size.row,
         "header": HEADER_SIZE,
         "constant_bytes": number * (len(made.table) + 2 * F + 1) + 8 * F + len(made.mark),
-        "state_bytes": 8 * (HEADER_SIZE + 2 + -(-(made.recursion.size - HEADER_SIZE) * number // 8)),
+        "state_bytes": 8 * (HEADER_SIZE + 2 + -(-(len(made.start) - HEADER_SIZE) * number // 8)),
         "image_bytes": len(pack_image(made.mark, made.start, 0.0, off + 1.0)),
         "on_delay": on,
         "off_delay": off,
@@ -154,7 +157,7 @@ def _code(made: ExportConstants, name: str, single: bool) -> dict[str, str]:
     healthy = [(c_literal(H.real, single), c_literal(H.imag, single)) for H in made.healthy.H]
     return {
         "guard": f"{name.upper()}_H",
-        "units": plain_text("; ".join(f"{each} [{unit}]" for each, unit in made.coefficients)),
+        "units": plain_text("; ".join(f"{coefficient} [{unit}]" for coefficient, unit in made.coefficients)),
         "constants": _constant_table(made.table, dict(made.spec.at), single),
         "frequency_list": ", ".join(map(c_literal, made.baseline.loop.monitor.frequencies)),
         "healthy": ",\n".join(f"    {{{real}, {imag}}}" for real, imag in healthy),

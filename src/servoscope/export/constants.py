@@ -6,10 +6,13 @@ import re
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from servoscope import __version__
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError
+from servoscope.detection.covariate_monitor import CovariateMonitor
 from servoscope.diagnosis.monitor_constants import MonitorConstants
 from servoscope.estimation.frequency_response import FrequencyResponse
 from servoscope.estimation.kernel.sample_steps import ARMED, SAMPLE
@@ -17,7 +20,7 @@ from servoscope.estimation.kernel.spec import KernelSpec
 from servoscope.estimation.recursion import Recursion
 from servoscope.export.image import fingerprint
 
-__all__ = ["ExportConstants", "check_name", "common_words", "plain_text"]
+__all__ = ["ExportConstants", "check_name", "common_words", "plain_text", "refuse_covariates"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +36,8 @@ class ExportConstants:
     members: int  # CUSUMs
     delays: tuple[int, int]  # of the alarm, in evaluations
     mark: bytes  # of the baseline, in images
+    covariates: CovariateMonitor | None
+    expected: FloatArray  # healthy coefficients without the regression's bias, (n,)
     input_stage: str  # what the caller has to do to u beforehand; empty: nothing
 
     @classmethod
@@ -55,10 +60,10 @@ class ExportConstants:
                 f"an exported monitor follows one operating point, this baseline has {', '.join(baseline.points)}: "
                 f"give --point {baseline.points[0]}"
             )
-        if baseline.covariates is not None:
+        if baseline.covariates is not None and baseline.covariates.warm_up is not None:
             raise BaselineError(
-                f"{loop.name}: an exported monitor knows no covariates, this baseline has "
-                f"{', '.join(baseline.covariates.names)}: export baseline.at(...) their values"
+                f"{loop.name}: a warm-up that is not logged cannot be exported: learn a baseline with "
+                "[monitor] hidden_warm_up = false"
             )
         stage = _input_stage(baseline)
         if stage and not only_coefficients:
@@ -74,6 +79,11 @@ class ExportConstants:
         derived = MonitorConstants.from_baseline(baseline)
         if only_coefficients:
             derived = replace(derived, constants=derived.constants._replace(watch=None))
+        covariates = derived.side.covariates
+        if single and covariates is not None:
+            raise BaselineError(
+                f"{loop.name}: a baseline with covariates cannot be exported in single precision: take double"
+            )
         if single and not derived.constants.steady:
             raise BaselineError(
                 f"[monitor] estimator = {loop.monitor.estimator!r} cannot be exported in single precision: take "
@@ -81,6 +91,10 @@ class ExportConstants:
             )
         recursion = Recursion([derived.constants], single=single)
         table, start = recursion._table[0], recursion.start()[0]
+        structure = repr(recursion._spec) + "single" * single
+        if covariates is not None:
+            start = np.concatenate([start, covariates.start()])
+            structure += covariates.model.model_dump_json()
         on, off = derived.pipeline.delays
         watch = derived.constants.watch
         return cls(
@@ -93,11 +107,13 @@ class ExportConstants:
             members=0 if watch is None else len(watch.limits),
             delays=(on, off),
             mark=fingerprint(
-                repr(recursion._spec) + "single" * single,
+                structure,
                 table,
                 start,
                 (baseline.thresholds.statistic, float(on), float(off)),
             ),
+            covariates=covariates,
+            expected=derived.expected_theta,
             input_stage=stage,
         )
 
@@ -133,6 +149,15 @@ def _input_stage(baseline: Baseline) -> str:
     if loop.monitor.two_stage != "none":
         return f"[monitor] two_stage = {loop.monitor.two_stage!r}"
     return "[plant] valve_law = 'square-root'" if loop.plant.load_pressure else ""
+
+
+def refuse_covariates(baseline: Baseline, what: str) -> None:
+    """Raise BaselineError if a baseline has covariates, which C alone takes; `what` cannot."""
+    if baseline.covariates is not None:
+        raise BaselineError(
+            f"{baseline.loop.name}: a {what} takes r, u and y alone, this baseline has "
+            f"{', '.join(baseline.covariates.names)}: export C, or baseline.at(...) their values"
+        )
 
 
 def check_name(name: str) -> None:

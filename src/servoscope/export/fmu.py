@@ -18,6 +18,7 @@ from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import OutputError
 from servoscope.core.files import atomic_write
 from servoscope.export.c_monitor import NAME, CMonitor, export_c, fill_template
+from servoscope.export.constants import refuse_covariates
 
 __all__ = ["export_fmu"]
 
@@ -56,10 +57,11 @@ def export_fmu(baseline: Baseline, path: str | Path, name: str = NAME, *, only_c
     OutputError
         If the compiler refuses the sources, or the file cannot be written.
     """
+    refuse_covariates(baseline, "co-simulation unit")
     made = export_c(baseline, name, only_coefficients=only_coefficients)
     source = fill_template("fmi3.c", {"prefix": name, "upper": name.upper(), "token": _token(made)})
-    sources = {each: made.files[each] for each in (f"{name}.c", f"{name}.h")} | {"fmi3.c": source}
-    contents = {f"sources/{each}": text.encode() for each, text in sources.items()}
+    sources = {file: made.files[file] for file in (f"{name}.c", f"{name}.h")} | {"fmi3.c": source}
+    contents = {f"sources/{file}": text.encode() for file, text in sources.items()}
     contents["modelDescription.xml"] = _xml(_model_description(baseline, made, name))
     contents["sources/buildDescription.xml"] = _xml(_build_description(name))
     binary = _compile(sources, name)
@@ -67,8 +69,8 @@ def export_fmu(baseline: Baseline, path: str | Path, name: str = NAME, *, only_c
         contents[_binary_path(name)] = binary
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as unit:
-        for each, content in contents.items():
-            unit.writestr(zipfile.ZipInfo(each, EPOCH), content, zipfile.ZIP_DEFLATED)
+        for file, content in contents.items():
+            unit.writestr(zipfile.ZipInfo(file, EPOCH), content, zipfile.ZIP_DEFLATED)
     atomic_write(path, archive.getvalue())
     return binary is not None
 
@@ -90,8 +92,8 @@ def _compile(sources: dict[str, str], name: str) -> bytes | None:
     if compiler is None:
         return None
     with tempfile.TemporaryDirectory() as scratch:
-        for each, text in sources.items():
-            Path(scratch, each).write_text(text, encoding="utf-8")
+        for file, text in sources.items():
+            Path(scratch, file).write_text(text, encoding="utf-8")
         command = [compiler, *FLAGS, "-o", "unit", "fmi3.c", f"{name}.c", "-lm"]
         done = subprocess.run(command, cwd=scratch, capture_output=True, text=True, check=False)
         if done.returncode:
@@ -110,8 +112,8 @@ def _build_description(name: str) -> Xml.Element:
     root = Xml.Element("fmiBuildDescription", fmiVersion="3.0")
     configuration = Xml.SubElement(root, "BuildConfiguration", modelIdentifier=name)
     files = Xml.SubElement(configuration, "SourceFileSet", language="C99", compilerOptions="-ffp-contract=off")
-    for each in ("fmi3.c", f"{name}.c"):
-        Xml.SubElement(files, "SourceFile", name=each)
+    for source in ("fmi3.c", f"{name}.c"):
+        Xml.SubElement(files, "SourceFile", name=source)
     Xml.SubElement(configuration, "Library", name="m", external="true")
     return root
 

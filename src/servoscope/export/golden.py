@@ -10,15 +10,19 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.covariates import CovariateModel
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
-from servoscope.detection.statistic import apply_alarm_delays, consecutive_exceedances
-from servoscope.estimation.recursion import Recursion
+from servoscope.core.jit.c_source import c_literal
+from servoscope.detection.covariate_monitor import CovariateMonitor
+from servoscope.detection.statistic import apply_alarm_delays, consecutive_exceedances, t2_statistic
+from servoscope.export.constants import ExportConstants
 from servoscope.signals.quality import QualityLimits, QualitySettings, check_block, init_state
 
-__all__ = ["GoldenRun", "golden_signals", "golden_text"]
+__all__ = ["GoldenRun", "golden_covariates", "golden_signals", "golden_text"]
 
 MIN_GOLDEN_SAMPLES, MAX_GOLDEN_SAMPLES = 2000, 20_000  # samples
 SEED = 27
+TOLERANCE = 1e-9  # of T^2 beside covariates, relative above 1
 FROZEN = {"frozen_y": 1, "frozen_u": 2}
 WAITING, HEALTHY, FAULT = range(3)
 FNV_OFFSET, FNV_PRIME = 14695981039346656037, 1099511628211
@@ -47,8 +51,8 @@ def golden_signals(
     u[samples // 2 :] *= 0.8
     restart = np.zeros(samples, dtype=np.bool_)
     restart[rng.integers(0, samples, 3)] = True
-    rest = slice(3 * samples // 4, 3 * samples // 4 + samples // 20)
-    r[rest], u[rest], y[rest] = 0.0, -0.0, 0.0
+    dropout = slice(3 * samples // 4, 3 * samples // 4 + samples // 20)
+    r[dropout], u[dropout], y[dropout] = 0.0, -0.0, 0.0
     for signal, wrong in zip((r, u, y, u), (np.nan, np.inf, np.nan, 1e150), strict=True):
         begin = int(rng.integers(samples // 10, samples - 20))
         signal[begin : begin + int(rng.integers(1, 6))] = wrong
@@ -68,23 +72,61 @@ class GoldenRun:
     held: int  # sample at which y, and then u, is held to look frozen
     stretch: int  # samples of each of four stretches; y is held in the second, u in the last
     frozen: IntArray  # what is found to be frozen at each of them, 1 y, 2 u
+    covariates: FloatArray | None = None  # at each sample, shape (N, k)
 
     @classmethod
-    def from_baseline(
-        cls, baseline: Baseline, recursion: Recursion, limit: float, delays: tuple[int, int]
-    ) -> GoldenRun:
+    def from_baseline(cls, made: ExportConstants) -> GoldenRun:
         """Run a monitor over its golden samples."""
-        c = recursion.constants[0]
+        baseline, recursion, limit = made.baseline, made.recursion, made.baseline.thresholds.statistic
+        c, monitor, covariates = recursion.constants[0], made.covariates, None
         samples = int(np.clip(8 * c.wait + 20 * c.every, MIN_GOLDEN_SAMPLES, MAX_GOLDEN_SAMPLES))
         *signals, restart = golden_signals(baseline, samples)
         with np.errstate(over="ignore"):  # of values that are no physical signal
             r, u, y = (x.astype(recursion.number) for x in signals)
-        state, rows = recursion.run(recursion.start(), r[None], u[None], y[None], restart[None])
-        verdicts, alarm = judge(rows[0], limit, delays)
+        begin, taken = recursion.start(), r
+        if monitor is not None:
+            covariates = golden_covariates(monitor.model, samples)
+            beside = monitor.start()
+            channels = dict(zip(monitor.model.names, covariates.T, strict=True))
+            averages, theta = monitor.run(beside, (r, u, y), restart, channels)
+            taken = np.where(np.isnan(averages).any(axis=1), np.nan, r)
+            if theta is not None:
+                recursion.named(begin)["theta"][0] = np.linalg.solve(c.basis, theta - c.origin)
+        index = recursion.rows(begin, samples)
+        state, rows = recursion.run(begin, taken[None], u[None], y[None], restart[None])
+        if monitor is not None:
+            state = np.concatenate([state, beside[None]], axis=1)
+            rows = rows.copy()
+            _move_rows(monitor, rows[0], averages[index], made.expected)
+        verdicts, alarm = judge(rows[0], limit, made.delays)
         limits = QualitySettings().limits(baseline.loop.sample_rate)
         held, stretch = samples // 3, limits.frozen + samples
         frozen = frozen_signals(limits, *held_signals((r, u, y), held, stretch))
-        return cls((r, u, y), restart, rows[0].copy(), verdicts, state[0].copy(), alarm, held, stretch, frozen)
+        return cls(
+            (r, u, y), restart, rows[0].copy(), verdicts, state[0].copy(), alarm, held, stretch, frozen, covariates
+        )
+
+
+def golden_covariates(model: CovariateModel, samples: int) -> FloatArray:
+    """Return covariates (samples, k): none at first, then a new value at each tenth sample, at the end outside."""
+    at = np.arange(samples)[:, None] / samples
+    low, high = np.array(model.low), np.array(model.high)
+    values = low + (high - low) * np.where(at < 0.8, at / 0.8, 2.0)
+    return np.where((np.arange(samples)[:, None] % 10 == 0) & (at > 0.01), values, np.nan)
+
+
+def _move_rows(monitor: CovariateMonitor, rows: FloatArray, averages: FloatArray, expected: FloatArray) -> None:
+    """Compare evaluations (K, row) with what is healthy at averages of the covariates (K, k), in place.
+
+    Where they are not known, or outside of what was learned, there are no updates.
+    """
+    n = len(expected)
+    moved, more, known = monitor.expect(averages)
+    covariance = rows[:, 4 + n : 4 + n + n * n]
+    covariance += more.reshape(len(rows), -1)
+    T2 = t2_statistic(rows[:, 4 : 4 + n], expected + moved, covariance.reshape(-1, n, n))
+    rows[:, 1] = np.where((rows[:, 0] > 0.0) & known, T2, 0.0)
+    rows[:, 0] = np.where(known, rows[:, 0], 0.0)
 
 
 def held_signals(
@@ -132,6 +174,7 @@ def golden_text(run: GoldenRun, prefix: str, image: bytes) -> str:
     samples_of = np.ascontiguousarray(np.stack(run.signals, axis=1))
     bits = samples_of.view(np.dtype(f"u{samples_of.itemsize}"))
     digests = [digest(row.astype(row.dtype.newbyteorder("<")).tobytes()) for row in run.rows]
+    lines = _covariate_lines(run)
     samples = ",\n".join("{" + ", ".join(f"0x{x:0{2 * bits.itemsize}X}u" for x in row) + "}" for row in bits.tolist())
     return "\n".join(
         [
@@ -146,9 +189,22 @@ def golden_text(run: GoldenRun, prefix: str, image: bytes) -> str:
             f"#define GOLDEN_STRETCH {run.stretch}u",
             f"#define GOLDEN_FROZEN 0x{digest(run.frozen.tolist()):016X}u",
             f"static const unsigned char golden_image[] = {{{_list(image)}}};",
+            *lines,
             "",
         ]
     )
+
+
+def _covariate_lines(run: GoldenRun) -> list[str]:
+    """Return what a self-test compares within a tolerance, since exp and sums are rounded elsewhere by other rules."""
+    if run.covariates is None:
+        return []
+    values = ",\n".join("{" + ", ".join(map(c_literal, row)) + "}" for row in run.covariates.tolist())
+    return [
+        f"#define GOLDEN_TOLERANCE {TOLERANCE} /* of a statistic, relative above 1 */",
+        f"static const double golden_covariates[GOLDEN_SAMPLES][{run.covariates.shape[1]}] = {{\n{values}}};",
+        f"static const double golden_statistics[] = {{{_list(map(c_literal, run.rows[:, 1].tolist()))}}};",
+    ]
 
 
 def _list(items: object) -> str:

@@ -22,7 +22,7 @@ def describe_rounding(made: ExportConstants, only_coefficients: bool, golden: Go
     by exp(d h) where d is in units of a CUSUM's limit h.
     """
     double = ExportConstants.from_baseline(made.baseline, only_coefficients)
-    exact = GoldenRun.from_baseline(made.baseline, double.recursion, made.baseline.thresholds.statistic, made.delays)
+    exact = GoldenRun.from_baseline(double)
     limit = made.baseline.thresholds.statistic
     near = exact.rows[:, 1] < 2.0 * limit  # far above it, nothing hangs on an error
     watch = double.recursion.constants[0].watch

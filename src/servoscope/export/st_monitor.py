@@ -14,7 +14,7 @@ from servoscope.core.files import atomic_write, make_folder
 from servoscope.core.jit.st_source import st_literal
 from servoscope.estimation.kernel.sample_steps import HEADER_SIZE
 from servoscope.export.c_monitor import NAME, fill_template, wrapped
-from servoscope.export.constants import ExportConstants, check_name, common_words, plain_text
+from servoscope.export.constants import ExportConstants, check_name, common_words, plain_text, refuse_covariates
 from servoscope.export.steps import StepTexts
 from servoscope.export.steps_st import step_texts, temporaries
 
@@ -40,6 +40,7 @@ def export_st(baseline: Baseline, name: str = NAME, *, only_coefficients: bool =
     BaselineError
         If the baseline has something that cannot be exported; the message names it.
     """
+    refuse_covariates(baseline, "function block")
     check_name(name)
     made = ExportConstants.from_baseline(baseline, only_coefficients)
     return fill_template("monitor.st", common_words(made, name) | _words(made))
@@ -66,10 +67,10 @@ def _words(made: ExportConstants) -> dict[str, Any]:
     }
     return (
         _blocks(texts, made.recursion.constants[0].every if made.spec.sums else 0)
-        | {f"last_{each}": count - 1 for each, count in last.items()}
+        | {f"last_{array}": count - 1 for array, count in last.items()}
         | {
             "rate": f"{baseline.loop.sample_rate:g}",
-            "units": plain_text("; ".join(f"{each} {unit}" for each, unit in made.coefficients)),
+            "units": plain_text("; ".join(f"{coefficient} {unit}" for coefficient, unit in made.coefficients)),
             "limit": st_literal(baseline.thresholds.statistic),
             "on_delay": f"{on}.0",
             "off_delay": f"{off}.0",

@@ -134,12 +134,12 @@ class PlantExperiment:
         """Return innovations in standard deviations at the level of the start, (N,), and their mean log variance."""
         m, rate = len(self.names), self.loop.sample_rate
         plant = self.plant.scaled(dict(zip(self.names, np.exp(x[:m]).tolist(), strict=True)))
-        whole, rest = split_delay(float(x[-1]) / rate, rate)
+        whole, fraction = split_delay(float(x[-1]) / rate, rate)
         constant = self._nominal_offset + x[m + 1] * self.offset if self.offset else 0.0
         u = self.u[self.rows - whole] - constant
-        predictor = self.factory.predictor(plant, later_s=rest / rate, noise=self.noise(x))
+        predictor = self.factory.predictor(plant, later_s=fraction / rate, noise=self.noise(x))
         e = self._predicted(predictor, u, self.y)
-        if rest:
+        if fraction:
             # a predictor takes the input before a restart to be that at it; here it is known, and the likelihood would
             # jump at whole samples of delay without it
             missed = np.where(self.restart, self.u[self.rows - whole - 1] - self.u[self.rows - whole], 0.0)

@@ -33,9 +33,9 @@ class Predictor(NamedTuple):
     S: Array
 
     @classmethod
-    def concatenate(cls, each: Sequence[Predictor]) -> Predictor:
+    def concatenate(cls, predictors: Sequence[Predictor]) -> Predictor:
         """Put plants in a row."""
-        return cls(*(np.ascontiguousarray(np.concatenate(parts)) for parts in zip(*each, strict=True)))
+        return cls(*(np.ascontiguousarray(np.concatenate(parts)) for parts in zip(*predictors, strict=True)))
 
     def innovations(
         self,

@@ -147,12 +147,13 @@ def _evaluate_group(
 ) -> tuple[float, Cause]:
     """Return the logarithm of the odds of a common cause, and the cause."""
     names = evidence[0].names
-    alike = [i for i, each in enumerate(evidence) if each.names == names]
+    alike = [i for i, member in enumerate(evidence) if member.names == names]
     if not names:
         return -np.inf, Cause(key, group, tuple(assets), (0.0,) * len(assets), 0.0, "", 0.0, 1.0, (1.0, 1.0))
     arrays = [_evidence_arrays(evidence[i]) for i in alike]
-    each = [_member_log_likelihoods(*array, prior) for array in arrays]
-    together = np.sum([np.logaddexp(*both) for both in each], axis=0)  # log-likelihood of (f, s), shape (m, sizes)
+    likelihoods = [_member_log_likelihoods(*array, prior) for array in arrays]
+    # log-likelihood of (f, s), shape (m, sizes)
+    together = np.sum([np.logaddexp(*both) for both in likelihoods], axis=0)
     posterior = together + _log_prior(prior.size)
     by_parameter = _log_sum(posterior)
     evident, apart = _log_sum(by_parameter), _log_sum(_log_sum(together + _log_prior(prior.drift)))
@@ -161,7 +162,7 @@ def _evaluate_group(
     share = np.cumsum(np.exp(posterior[best] - by_parameter[best]))
     low, median, high = (float(np.exp(np.interp(q, share, SIZES))) for q in (0.025, 0.5, 0.975))
     weight = np.exp(posterior - evident)
-    own = [float((weight * np.exp(besides - np.logaddexp(shared, besides))).sum()) for shared, besides in each]
+    own = [float((weight * np.exp(besides - np.logaddexp(shared, besides))).sum()) for shared, besides in likelihoods]
     return float(odds), Cause(
         key=key,
         group=group,
@@ -194,8 +195,8 @@ def _member_log_likelihoods(score: FloatArray, information: FloatArray, prior: P
     """
     J, spread = np.diagonal(information)[:, None], (prior.scatter * SIZES) ** 2
     shared = SIZES * score[:, None] - 0.5 * SIZES**2 * J
-    rest = score[:, None] - SIZES * J
-    shared = shared - 0.5 * np.log1p(spread * J) + 0.5 * rest**2 * spread / (1.0 + spread * J)
+    remainder = score[:, None] - SIZES * J
+    shared = shared - 0.5 * np.log1p(spread * J) + 0.5 * remainder**2 * spread / (1.0 + spread * J)
     # a fault of its own besides: what the common change leaves of the score, shape (m, sizes, m)
     left = score - SIZES[None, :, None] * information[:, None, :]
     besides = SIZES * score[:, None] - 0.5 * SIZES**2 * J + np.log(prior.fault)

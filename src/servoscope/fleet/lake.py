@@ -128,7 +128,7 @@ def _walk_folders(where: str, partition: tuple[str, str]) -> Iterator[AssetDay]:
         raise RecordingError(f"{where}: no such folder, give a folder with asset=.../day=... in it") from None
     except OSError as error:
         raise RecordingError(f"{where}: cannot be read ({error})") from None
-    for info in sorted(infos, key=lambda each: each.path):
+    for info in sorted(infos, key=lambda info: info.path):
         parts = PurePosixPath(info.path).relative_to(root).parts
         if not info.is_file or not info.path.endswith((".parquet", ".pq")) or any(p[0] in "._" for p in parts):
             continue

@@ -67,7 +67,7 @@ def render_fleet_page(fleet: Fleet, lake: str) -> str:
         late=[(asset, format_count(rows)) for asset, rows in late],
         most=MAX_TABLE_ROWS,
         tones=TONES,
-        size=lambda one: format_size(one.ratio, *one.interval),
+        size=lambda fault: format_size(fault.ratio, *fault.interval),
         time=_format_time,
     )
 
@@ -87,8 +87,8 @@ def headline(fleet: Fleet) -> str:
 def describe_discoveries(fleet: Fleet) -> str:
     """Return which assets have changed at the false discovery rate, as plain text; empty where none has."""
     names = fleet.discovered
-    shown, more = names[:MAX_NAMES], _more(len(names) > MAX_NAMES)
-    values = {"count": len(names), "assets": len(fleet.assets), "names": shown, "more": more, "rate": RATE}
+    shown, surplus = names[:MAX_NAMES], _more(len(names) > MAX_NAMES)
+    values = {"count": len(names), "assets": len(fleet.assets), "names": shown, "more": surplus, "rate": RATE}
     return say("fleet.discovered", **values) if names else ""
 
 

@@ -157,14 +157,14 @@ def signals_from_table(table: Table, columns: Columns) -> tuple[FloatArray, Floa
 
 def covariates_from_table(table: Table, columns: Columns) -> dict[str, FloatArray]:
     """Return those covariates of a table that it has, by name, shape (N,) each."""
-    found, known = {}, list(table.columns)
+    covariates, known = {}, list(table.columns)
     for name, text in columns.covariates.items():
         try:
             combination = parse_combination(text, known, table.name)
         except (LoopError, RecordingError):
             continue
-        found[name] = _mix(table, combination, f"covariates.{name}")
-    return found
+        covariates[name] = _mix(table, combination, f"covariates.{name}")
+    return covariates
 
 
 def _mix(table: Table, mix: LinearCombination, key: str) -> FloatArray:

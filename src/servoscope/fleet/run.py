@@ -138,8 +138,8 @@ def _learn_baselines(
         return dict.fromkeys(wanted, str(plan.baselines)), {}
     if plan.baselines is not None:
         files = {name: baseline_path(plan.baselines, name) for name in wanted}
-        found = _existing(files)
-        return found, {name: f"there is no file {file}" for name, file in files.items() if found[name] is None}
+        baselines = _existing(files)
+        return baselines, {name: f"there is no file {file}" for name, file in files.items() if baselines[name] is None}
     if plan.loop is None:
         raise BaselineError("a fleet needs a loop to learn with, or baselines")
     folder = plan.output / "baselines"

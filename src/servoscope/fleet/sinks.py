@@ -144,12 +144,12 @@ def claim_checkpoint(session: SparkSession, folder: str, layout: Mapping[str, in
         except AnalysisException:  # there is none
             return []
 
-    found, otherwise = lines(f"{folder}/servoscope"), "begin in another folder after a day is over"
-    if not found and not lines(f"{folder}/offsets"):
+    begun, otherwise = lines(f"{folder}/servoscope"), "begin in another folder after a day is over"
+    if not begun and not lines(f"{folder}/offsets"):
         text = F.lit(json.dumps(dict(layout))).alias("value")
         session.range(1).select(text).write.mode("overwrite").text(f"{folder}/servoscope")
         return
-    known = json.loads(found[0]) if found else {}
+    known = json.loads(begun[0]) if begun else {}
     if known.get("layout") != layout["layout"]:
         raise OutputError(f"{folder}: this checkpoint is of another version: go on with that one, or {otherwise}")
     if known != layout:

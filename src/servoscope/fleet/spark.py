@@ -70,28 +70,28 @@ def session(master: str | None = None, **settings: str) -> SparkSession:
         ) from None
 
 
-def spark(found: SparkSession) -> Engine:
+def spark(session: SparkSession) -> Engine:
     """Return the engine whose tasks run on a cluster; each is one task of Spark, which tries it again elsewhere.
 
     The lake and the output folder must be where all executors see them; rows do not pass through Spark.
     """
 
     def run(tasks: Sequence[Task]) -> Iterator[TaskResult]:
-        step = max(1, WAVE * found.sparkContext.defaultParallelism)
+        step = max(1, WAVE * session.sparkContext.defaultParallelism)
         for i in range(0, len(tasks), step):
             wave = tasks[i : i + step]
             try:
-                yield from zip(wave, _run_tasks(found, wave), strict=True)
+                yield from zip(wave, _run_tasks(session, wave), strict=True)
             except Exception as error:
                 if not _is_stage_failure(error):
                     raise
                 for task in wave:  # one of them kills its executor: alone, it takes no other with it
-                    yield task, _run_isolated(found, task)
+                    yield task, _run_isolated(session, task)
 
     return run
 
 
-def _run_tasks(found: SparkSession, wave: Sequence[Task]) -> list[dict[str, Any]]:
+def _run_tasks(session: SparkSession, wave: Sequence[Task]) -> list[dict[str, Any]]:
     import pyarrow as pa
 
     def work(batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
@@ -99,13 +99,13 @@ def _run_tasks(found: SparkSession, wave: Sequence[Task]) -> list[dict[str, Any]
             for i in batch.column(0).to_pylist():
                 yield pa.RecordBatch.from_pydict({"i": [i], "result": [json.dumps(wave[i].run())]})
 
-    done = found.range(0, len(wave), 1, len(wave)).mapInArrow(work, "i long, result string").collect()
-    return [json.loads(each.result) for each in sorted(done, key=lambda each: each.i)]
+    done = session.range(0, len(wave), 1, len(wave)).mapInArrow(work, "i long, result string").collect()
+    return [json.loads(task.result) for task in sorted(done, key=lambda task: task.i)]
 
 
-def _run_isolated(found: SparkSession, task: Task) -> dict[str, Any]:
+def _run_isolated(session: SparkSession, task: Task) -> dict[str, Any]:
     try:
-        return _run_tasks(found, [task])[0]
+        return _run_tasks(session, [task])[0]
     except Exception as error:
         if not _is_stage_failure(error):
             raise

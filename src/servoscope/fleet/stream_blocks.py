@@ -159,8 +159,8 @@ def from_text(text: str) -> bytes:
     content = text.encode("ascii")
     used = len(content) // 64 * 64
     *words, highest = np.frombuffer(content, dtype=np.uint64, count=used // 8).reshape(8, -1)
-    found = np.array([word | (((highest >> i) & ONES) << 7) for i, word in enumerate(words)])
-    return found.tobytes()[: int(content[used:])]
+    decoded = np.array([word | (((highest >> i) & ONES) << 7) for i, word in enumerate(words)])
+    return decoded.tobytes()[: int(content[used:])]
 
 
 def check_lists(lists: Sequence[str], names: Sequence[str], time: str) -> None:

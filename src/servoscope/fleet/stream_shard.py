@@ -109,7 +109,7 @@ class StreamShard:
         if due is not None:
             self._handle.registerTimer(due // 1000 + 1)
         packed = {asset: state.pack() for asset, state in self._states.items()}
-        numbers = {"next": self._next_entry, "assets": [(asset, len(each)) for asset, each in packed.items()]}
+        numbers = {"next": self._next_entry, "assets": [(asset, len(state)) for asset, state in packed.items()]}
         self._head.update((to_text(json.dumps(numbers).encode() + b"\n" + b"".join(packed.values())),))
 
     def store_rows(self, blocks: Iterable[AssetRows]) -> Iterator[Any]:
@@ -204,11 +204,11 @@ class StreamShard:
                     begin = state.state if state.state is not None else monitor.start()
                     steps[asset] = DayStep(monitor, begin, of_day, partial(self._rows, asset))
             evaluations: dict[str, EvaluationBlock] = {}
-            for asset, found in zip(steps, DayMonitor.advance_lanes(list(steps.values())), strict=True):
-                if isinstance(found, Exception):
-                    self._states[asset].error = error_text(found)
+            for asset, outcome in zip(steps, DayMonitor.advance_lanes(list(steps.values())), strict=True):
+                if isinstance(outcome, Exception):
+                    self._states[asset].error = error_text(outcome)
                     continue
-                self._states[asset].state, evaluations[asset] = found
+                self._states[asset].state, evaluations[asset] = outcome
             if any(len(block.time_us) for block in evaluations.values()):
                 yield self._trace_frame(evaluations)
         for asset in pending:

@@ -132,7 +132,7 @@ def _create_processor(baselines: Baselines, delay_us: int) -> Any:
 
         def handleInputRows(self, key: Any, rows: Iterator[Any], timerValues: Any) -> Iterator[Any]:
             shard = self.shard()
-            yield from shard.store_rows(AssetRows.unpack(bytes(each)) for frame in rows for each in frame["rows"])
+            yield from shard.store_rows(AssetRows.unpack(bytes(packed)) for frame in rows for packed in frame["rows"])
             shard.save()
 
         def handleExpiredTimer(self, key: Any, timerValues: Any, expiredTimerInfo: Any) -> Iterator[Any]:

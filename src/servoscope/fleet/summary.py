@@ -115,11 +115,13 @@ def summarise_fleet(
     now = _common_causes(last, groups, prior)
     assets = [_summarise_asset(entry, groups, now, states[entry["asset"]], prior) for entry in last]
     rank = ["fault", COMMON, "undetermined", FAILED, "healthy"]
-    assets.sort(key=lambda one: (rank.index(one.state), -one.probability, one.asset))
+    assets.sort(key=lambda asset: (rank.index(asset.state), -asset.probability, asset.asset))
     failed = [(e["asset"], e["day"], str(e["error"])) for e in entries if e["status"] == FAILED]
     since = tuple(_first_accepted_day(cause, causes_by_day) for cause in now)
-    found = discover({e["asset"]: _parse_evidence(e) for e in last if "evidence" in e}, prior)
-    return Fleet(tuple(assets), tuple(now), since, states, tuple(failed), dict(unlearned), dict(late or {}), found)
+    discoveries = discover({e["asset"]: _parse_evidence(e) for e in last if "evidence" in e}, prior)
+    return Fleet(
+        tuple(assets), tuple(now), since, states, tuple(failed), dict(unlearned), dict(late or {}), discoveries
+    )
 
 
 def discover(evidence: Mapping[str, Evidence], prior: Prior = PRIOR, rate: float = RATE) -> tuple[str, ...]:
@@ -130,7 +132,7 @@ def discover(evidence: Mapping[str, Evidence], prior: Prior = PRIOR, rate: float
     assets have in common: warm days, or one baseline (Wang and Ramdas, 2022, Journal of the Royal Statistical Society
     B, 84(3), proposition 2).
     """
-    logs = {asset: log_fault_evidence(one, prior) for asset, one in evidence.items()}
+    logs = {asset: log_fault_evidence(changes, prior) for asset, changes in evidence.items()}
     order = sorted(logs, key=lambda asset: (-logs[asset], asset))
     N = len(order)
     enough = [k for k, asset in enumerate(order, 1) if logs[asset] >= np.log(N / (k * rate))]

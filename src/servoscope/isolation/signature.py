@@ -10,6 +10,8 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 from servoscope.models.plants import Fault
 
+MAX_FREE_RATIO = 0.3  # smallest ratio of a fault up to which its coefficient may as well change its sign
+
 
 @dataclass(frozen=True)
 class Signature:
@@ -40,6 +42,10 @@ def parameter_signature(fault: Fault, shift_of_ratio: Callable[[float], FloatArr
 
 
 def coefficient_signature(fault: Fault, direction: FloatArray) -> Signature:
-    """Return the signature of a coefficient: theta moves along `direction`, its value of today, either way."""
+    """Return the signature of a coefficient: theta moves along `direction`, its value of today, either way.
+
+    One whose smallest ratio is near 1 hardly falls: friction, a lag.
+    """
     reach = max(fault.ratio_range[1] - 1.0, 1.0)
-    return Signature(fault, lambda x: x * direction, lambda x: 1.0 + x, -reach, reach)
+    low = -reach if fault.ratio_range[0] <= MAX_FREE_RATIO else fault.ratio_range[0] - 1.0
+    return Signature(fault, lambda x: x * direction, lambda x: 1.0 + x, low, reach)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -15,7 +15,7 @@ from servoscope.baseline.plant_fit import fault_directions
 from servoscope.core.arrays import FloatArray
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.isolation.signature import Signature, coefficient_signature, parameter_signature
-from servoscope.models.plants import Fault, FaultRay
+from servoscope.models.plants import Fault, FaultRay, Plant
 from servoscope.signals import Recording
 
 Shift = Callable[[str, float], FloatArray]  # parameter of a fault and its ratio -> change of theta_hat, shape (n,)
@@ -64,19 +64,41 @@ def _plant_signatures(
     if plant.has_physics and not plant.parameters_are_coefficients:
         shift = _nominal_shifts(baseline, learned)
         return [parameter_signature(f, partial(shift, f.parameter)) for f in faults]
-    names = dict.fromkeys([*plant.parameters, *(name for ray in plant.rays for name in ray.exponents)])
-    directions = fault_directions(baseline.loop, plant, np.array(baseline.theta), [*names])
-    moving = [fault for fault in plant.faults if np.any(directions[fault.parameter])]
-    single = [
-        coefficient_signature(fault, learned @ directions[fault.parameter])
-        if {*plant.exponents(fault.parameter).values()} <= {1.0}
-        else parameter_signature(fault, _power_shift(baseline, plant.exponents(fault.parameter), learned))
-        for fault in moving
-    ]
-    single = [replace(signature, angle=plant.ray_angles.get(signature.fault.parameter, 0.0)) for signature in single]
+    theta = np.array(baseline.theta)
+    healthy = dict(zip(baseline.names, baseline.theta, strict=True))
+    powers = {fault.parameter: plant.exponents(fault.parameter, healthy) for fault in plant.faults}
+    single = power_signatures(plant, powers, baseline.names, theta, learned)
+    directions = fault_directions(
+        baseline.loop, plant, theta, [*dict.fromkeys(name for ray in plant.rays for name in ray.exponents)]
+    )
     return single + [
         _ray_signature(ray, learned, directions, _healthy_std(baseline, ray.full[0][0])) for ray in plant.rays
     ]
+
+
+def power_signatures(
+    plant: Plant,
+    exponents: Mapping[str, Mapping[str, float]],
+    names: Sequence[str],
+    theta: FloatArray,
+    taken_up: FloatArray,
+) -> list[Signature]:
+    """Return the curves of faults that move coefficients theta (n,) by powers of their ratio; of those that move any.
+
+    `exponents`: by parameter, the powers by coefficient; `taken_up`: see `learned_signature`.
+    """
+    signatures = []
+    for fault in plant.faults:
+        powers = np.array([exponents[fault.parameter].get(name, 0.0) for name in names])
+        if not (powers * theta).any():
+            continue
+        if {*powers.tolist()} <= {0.0, 1.0}:
+            signature = coefficient_signature(fault, taken_up @ (powers * theta))
+        else:
+            signature = parameter_signature(fault, partial(_power_shift, theta, powers, taken_up))
+        angle, error = (known.get(fault.parameter, 0.0) for known in (plant.ray_angles, plant.size_errors))
+        signatures.append(replace(signature, angle=angle, healthy_std=error))
+    return signatures
 
 
 def _healthy_std(baseline: Baseline, name: str) -> float:
@@ -100,12 +122,9 @@ def _ray_signature(
     return parameter_signature(ray.fault, shift, healthy_std)
 
 
-def _power_shift(
-    baseline: Baseline, exponents: Mapping[str, float], learned: FloatArray
-) -> Callable[[float], FloatArray]:
-    """Return how the coefficients move with powers of a parameter's ratio."""
-    theta, powers = np.array(baseline.theta), np.array([exponents.get(name, 0.0) for name in baseline.names])
-    return lambda ratio: np.asarray(learned @ (theta * (ratio**powers - 1.0)))
+def _power_shift(theta: FloatArray, powers: FloatArray, taken_up: FloatArray, ratio: float) -> FloatArray:
+    """Return how coefficients move with powers of a parameter's ratio."""
+    return np.asarray(taken_up @ (theta * (ratio**powers - 1.0)))
 
 
 def _simulated_shifts(baseline: Baseline, expectation: Expectation, onset: int) -> Shift:

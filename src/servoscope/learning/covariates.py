@@ -143,7 +143,7 @@ def _stretches_of(
         columns = np.column_stack([rec.channels[name] for name in names])
         for first in range(0, max(rec.samples - length, 0) + 1, length):
             rows = slice(first, first + length)
-            part = Regression(g.eta[rows], g.phi[rows], g.z[rows], g.ok[rows])
+            part = g.rows(rows)
             c = columns[rows][part.ok]
             if part.ok.sum() < MIN_SAMPLES_PER_COEFFICIENT * g.phi.shape[1] or np.isnan(c).all(axis=0).any():
                 continue

@@ -28,6 +28,7 @@ from servoscope.learning.detectability import learn_detectability
 from servoscope.learning.features import MIN_RECORDINGS, learn_features
 from servoscope.learning.healthy_plant import PlantKnowledge, learn_plant, learn_sequential_test
 from servoscope.learning.population import Population
+from servoscope.learning.pressures import learn_pressures
 from servoscope.learning.recursion import (
     HealthyRecordings,
     check_signals,
@@ -35,6 +36,7 @@ from servoscope.learning.recursion import (
     form_healthy_recordings,
     tune_pipeline,
 )
+from servoscope.learning.residual import MIN_RECORDINGS as MIN_RECORDINGS_OF_RESIDUAL
 from servoscope.learning.residual import learn_residuals
 from servoscope.learning.scatter import follow_recordings, learn_scatter, learn_thresholds, widen_scatter
 from servoscope.models.loop import Loop
@@ -203,7 +205,23 @@ def _assemble_baseline(
         covariates=healthy.covariates,
     )
     progress("predictor")
-    return _with_residuals(_with_exact_predictor(baseline, recordings), healthy)
+    return _with_pressures(_with_residuals(_with_exact_predictor(baseline, recordings), healthy), healthy)
+
+
+def _with_pressures(baseline: Baseline, healthy: HealthyRecordings) -> Baseline:
+    """Learn the pressures where they are logged; a change that they show is promised, however small for the others."""
+    model = learn_pressures(healthy)
+    if model is None and healthy.loop.plant.channels:
+        note = message("learning.no_pressures", needed=MIN_RECORDINGS_OF_RESIDUAL)
+        return baseline.model_copy(update={"notes": (*baseline.notes, note)})
+    if model is None:
+        return baseline
+    own, promised = model.detectable_changes, []
+    for change in baseline.detectability.changes:
+        smallest = min(change.change or np.inf, own.get(change.parameter, np.inf))
+        promised.append(change.model_copy(update={"change": smallest if np.isfinite(smallest) else None}))
+    detectability = baseline.detectability.model_copy(update={"changes": tuple(promised)})
+    return baseline.model_copy(update={"pressures": model, "detectability": detectability})
 
 
 def _with_residuals(baseline: Baseline, healthy: HealthyRecordings) -> Baseline:

@@ -22,6 +22,7 @@ from servoscope.learning.inspection import Inspection, inspect
 from servoscope.learning.inspection.rules import advised_rest_speed
 from servoscope.learning.plant_choice import PlantCandidate, choose_plant
 from servoscope.models.loop import Columns, Loop, MonitorSettings
+from servoscope.models.plants import plant_class
 from servoscope.signals import Recording
 from servoscope.signals.readers import ChannelInfo, list_channels, read
 from servoscope.signals.readers.axes import find_axes, signal_names
@@ -30,6 +31,7 @@ from servoscope.signals.readers.formats import open_file
 from servoscope.signals.readers.guess_columns import (
     FIELDS,
     guess_mapping,
+    guess_pressures,
     mapping_template,
     names_speed,
     names_target_torque,
@@ -173,7 +175,7 @@ def propose_loop(paths: Sequence[Path], columns: Columns, where: Mapping[str, st
         candidates = choose_plant(recordings, cutoff, is_speed, inspection.rest.speed)
     except NotEnoughError as error:
         raise RecordingError(f"{path}: {error}") from None
-    chosen = candidates[0]
+    chosen = _with_pressures(candidates[0], path, columns)
     loop = loop_of(chosen.settings)
     held = []
     if (speed := advised_rest_speed(inspect(recording, loop), loop)) is not None:
@@ -221,6 +223,13 @@ def _inspect(recording: Recording, is_speed: bool) -> Inspection:
     return inspect(recording, Loop.from_dict({"sample_rate": recording.sample_rate, "plant": SPEED_AXIS}))
 
 
+def _with_pressures(chosen: PlantCandidate, path: Path, columns: Columns) -> PlantCandidate:
+    """Return a plant with the columns of pressures, where it takes some and the log has them."""
+    takes = "pressures" in plant_class(chosen.settings["kind"]).model_fields
+    pressures = guess_pressures([channel.name for channel in list_channels(path, columns.text)]) if takes else None
+    return chosen if pressures is None else replace(chosen, settings={**chosen.settings, "pressures": pressures})
+
+
 def _plant_lines(chosen: PlantCandidate) -> list[ProposalLine]:
     """Return the section on the plant; constant forces are part of each."""
     share = chosen.explained
@@ -228,7 +237,10 @@ def _plant_lines(chosen: PlantCandidate) -> list[ProposalLine]:
     lines = []
     for key, value in chosen.settings.items():
         why = explained if key == "kind" else message(f"init.of_{key}")
-        lines.append(ProposalLine("plant", key, json.dumps(value), why, key == "kind" and share < MIN_CLEAR_SHARE))
+        written = json.dumps(value, ensure_ascii=False)
+        if isinstance(value, Mapping):
+            written = f"{{{', '.join(f'{name} = {_quoted(text)}' for name, text in value.items())}}}"
+        lines.append(ProposalLine("plant", key, written, why, key == "kind" and share < MIN_CLEAR_SHARE))
     return lines
 
 

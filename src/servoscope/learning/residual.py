@@ -8,8 +8,10 @@ import numpy as np
 
 from servoscope.baseline.residual_model import POSITIONS, SPEED_SHARES, ResidualLayout, ResidualModel
 from servoscope.baseline.threshold import score_limit
-from servoscope.core.arrays import FloatArray
+from servoscope.core.arrays import FloatArray, to_tuples
+from servoscope.detection.homogeneity import prediction_factor
 from servoscope.estimation.pipeline import Pipeline
+from servoscope.estimation.tuning import least_squares
 from servoscope.learning.features import PAST_BUDGET
 from servoscope.learning.recursion import HealthyRecordings
 from servoscope.signals import Recording
@@ -52,7 +54,25 @@ def learn_residuals(healthy: HealthyRecordings, theta: FloatArray) -> ResidualMo
     if len(whole) < MIN_RECORDINGS:
         return None
     limits = score_limit(whole, share), SHIFT_MARGIN * score_limit(shift, PAST_BUDGET * share)
-    return _learn_model(layout, pipeline, recordings).model_copy(update={"limits": limits})
+    halves = to_tuples(_half_covariance(healthy, theta)) if healthy.loop.plant.fits_stretches else ()
+    return _learn_model(layout, pipeline, recordings).model_copy(update={"limits": limits, "halves": halves})
+
+
+def _half_covariance(healthy: HealthyRecordings, theta: FloatArray) -> FloatArray:
+    """Return the covariance (n, n) of a further fit to half a recording, about coefficients theta (n,)."""
+    halves = [half for g in healthy.regressions for half in g.halves if half.ok.sum() > len(theta)]
+    left = np.array([least_squares(half) for half in halves]) - theta
+    return further_covariance(left, len(healthy.recordings))
+
+
+def further_covariance(left: FloatArray, recordings: int) -> FloatArray:
+    """Return the covariance (n, n) of a further fit from what fits of so many recordings are off by, shape (m, n).
+
+    Of few fits, correlations count the less, as if as many fits without any as there are coefficients had been seen.
+    """
+    size, n = np.sqrt((left**2).mean(axis=0)), left.shape[1]
+    correlations = left.T @ left / np.outer(size, size) + n * np.eye(n)
+    return np.asarray(prediction_factor(recordings) * correlations / (len(left) + n) * np.outer(size, size))
 
 
 def _learn_model(layout: ResidualLayout, pipeline: Pipeline, recordings: Sequence[Recording]) -> ResidualModel:

@@ -36,8 +36,8 @@ def split_delay(delay: float, sample_rate: float) -> tuple[int, float]:
     """Split a delay [s] into whole samples and the rest, 0 <= rest < 1 sample."""
     samples = delay * sample_rate
     whole = int(np.floor(samples + _WHOLE_TOLERANCE))
-    rest = samples - whole
-    return whole, rest if rest > _WHOLE_TOLERANCE else 0.0
+    fraction = samples - whole
+    return whole, fraction if fraction > _WHOLE_TOLERANCE else 0.0
 
 
 def discretise(
@@ -48,14 +48,14 @@ def discretise(
     `system`: a (n, n), B (n, 1), C (1, n) of the continuous plant; `sample_rate`: samples per second [Hz]; `hold`:
     what the input does between samples; `delay`: time [s] from u to the plant; any fraction of a sample.
     """
-    return _discretise_cached(*(tuple(map(tuple, each.tolist())) for each in system), sample_rate, hold, delay)
+    return _discretise_cached(*(tuple(map(tuple, matrix.tolist())) for matrix in system), sample_rate, hold, delay)
 
 
 @functools.lru_cache(maxsize=64)  # while signatures are drawn, the healthy plant comes back with every point
 def _discretise_cached(
     a: MatrixRows, b: MatrixRows, c: MatrixRows, sample_rate: float, hold: str, delay: float
 ) -> DiscretePlant:
-    A, B, C = (np.array(each) for each in (a, b, c))
+    A, B, C = (np.array(matrix) for matrix in (a, b, c))
     return discretise_uncached((A, B, C), sample_rate, hold, delay)
 
 
@@ -63,21 +63,21 @@ def discretise_uncached(system: StateSpace, sample_rate: float, hold: str, delay
     """Do as `discretise`, without looking whether this plant was seen before: a search never meets one again."""
     A, B, C = system
     T = 1.0 / sample_rate
-    m, rest = split_delay(delay, sample_rate)
-    Phi, level, slope = transition(A, B, (1.0 - rest) * T)
+    m, fraction = split_delay(delay, sample_rate)
+    Phi, level, slope = transition(A, B, (1.0 - fraction) * T)
     late = np.zeros_like(level)
     if hold == "zoh":
         ahead, now = np.zeros_like(level), level
     else:
         ahead, now = slope / T, level - slope / T
-    if rest > 0.0:
-        first, level_first, slope_first = transition(A, B, rest * T)
+    if fraction > 0.0:
+        first, level_first, slope_first = transition(A, B, fraction * T)
         if hold == "zoh":
             late = Phi @ level_first
         else:
             # The sample begins a share (1 - rest) of the way from u(k-m-1) to u(k-m).
-            now = now + Phi @ ((1.0 - rest) * level_first + slope_first / T)
-            late = Phi @ (rest * level_first - slope_first / T)
+            now = now + Phi @ ((1.0 - fraction) * level_first + slope_first / T)
+            late = Phi @ (fraction * level_first - slope_first / T)
         Phi = Phi @ first
     return DiscretePlant(Phi, ahead, now, late, C[0], m)
 

@@ -168,7 +168,7 @@ class Loop(ShortRepr, Settings):
     def _one_or_several(cls, value: object) -> object:
         if not isinstance(value, Mapping):
             return value
-        return {name: [one] if isinstance(one, str) else one for name, one in value.items()}
+        return {name: [names] if isinstance(names, str) else names for name, names in value.items()}
 
     @field_validator("plant", mode="before")
     @classmethod
@@ -390,11 +390,11 @@ def _parse_plant_table(mapping: Mapping[str, Any], source: str) -> plants.Plant:
     try:
         if "kind" not in mapping:
             return plants.parse_plant(mapping)
-        found = plants.plant_class(mapping["kind"])
+        plant = plants.plant_class(mapping["kind"])
     except LoopError as error:
         raise LoopError(f"{source}: {error}") from None
     try:
         # Strict, so that "4.0" in quotes or `true` is refused as in every other section.
-        return found.model_validate(dict(mapping), strict=True)
+        return plant.model_validate(dict(mapping), strict=True)
     except ValidationError as error:
-        raise LoopError(f"{source}: {describe_error(error, found, section='plant')}") from None
+        raise LoopError(f"{source}: {describe_error(error, plant, section='plant')}") from None

@@ -211,10 +211,10 @@ def _gramian_factor(A: FloatArray, B: FloatArray) -> FloatArray:
     """Return L with ``L L' = sum_i A^i B B' A'^i``, by doubling (Smith, 1968): small parts keep their digits."""
     L, power = B, A
     while True:
-        more = power @ L
-        U, s, _ = np.linalg.svd(np.hstack([L, more]), full_matrices=False)
+        increment = power @ L
+        U, s, _ = np.linalg.svd(np.hstack([L, increment]), full_matrices=False)
         L, power = np.asarray(U * s, dtype=np.float64), power @ power
-        if np.all(np.abs(more).max(axis=1) <= ROUNDING_TOLERANCE * np.abs(L).max(axis=1)):
+        if np.all(np.abs(increment).max(axis=1) <= ROUNDING_TOLERANCE * np.abs(L).max(axis=1)):
             return L
 
 
@@ -277,16 +277,16 @@ def state_variable_filter(cutoff: float, order: int) -> StateSpace:
     return rate * A, rate * B, np.diag(rate ** np.arange(order, dtype=np.float64))
 
 
-def settling_samples(cutoff: float, order: int, dt: float, rest: float = 1e-3) -> int:
-    """Count the samples after which a step's transient in a state-variable filter is below `rest`."""
-    return math.ceil(_settling_time(order, rest) / (2.0 * math.pi * cutoff * dt))
+def settling_samples(cutoff: float, order: int, dt: float, tolerance: float = 1e-3) -> int:
+    """Count the samples after which a step's transient in a state-variable filter is below `tolerance`."""
+    return math.ceil(_settling_time(order, tolerance) / (2.0 * math.pi * cutoff * dt))
 
 
 @functools.cache
-def _settling_time(order: int, rest: float) -> float:
+def _settling_time(order: int, tolerance: float) -> float:
     """Return the same in time constants of the filter."""
     x = 0.0
-    while sum(x**j / math.factorial(j) for j in range(order)) * math.exp(-x) > rest:
+    while sum(x**j / math.factorial(j) for j in range(order)) * math.exp(-x) > tolerance:
         x += 0.01
     return x
 

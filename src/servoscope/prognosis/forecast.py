@@ -146,7 +146,7 @@ def prognose(series: SizeSeries, limit: float, coverage: float = 0.9) -> Prognos
         key = "receding" if odds >= MIN_ODDS and towards < 1.0 - MIN_DIRECTION_PROBABILITY else "steady"
         return Prognosis(**asked, outlook="none", headline=message(f"prognosis.{key}", **about, history=history))
     passage = shortest_interval(drawn.passage * posterior.length_s, coverage)
-    remaining = tuple(each if math.isfinite(each) else None for each in passage)
+    remaining = tuple(time if math.isfinite(time) else None for time in passage)
     asked["remaining_s"] = remaining
     if remaining[0] is None:
         horizon = _span(HORIZON * posterior.length_s)

@@ -51,9 +51,9 @@ class SizeSeries:
 
         Raises PrognosisError if the arrays differ in length or nothing is left of them.
         """
-        columns = [np.asarray(each, dtype=float) for each in (t, value)]
+        columns = [np.asarray(column, dtype=float) for column in (t, value)]
         columns.append(np.zeros_like(columns[0]) if std is None else np.asarray(std, dtype=float))
-        columns += [np.asarray(each, dtype=float) for each in (covariates or {}).values()]
+        columns += [np.asarray(column, dtype=float) for column in (covariates or {}).values()]
         lengths = sorted({column.size for column in columns})
         if len(lengths) > 1:
             raise PrognosisError(f"{name}: its columns have different lengths, {lengths[0]} and {lengths[-1]}")

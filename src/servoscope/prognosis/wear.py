@@ -62,7 +62,7 @@ class Courses:
     @classmethod
     def without_wear(cls) -> Courses:
         """Return a grid of courses whose size only wanders."""
-        diffusion, noise = (each.ravel() for each in np.meshgrid(0.003 * 30.0 ** _grid(8), 0.8 * 1.6 ** _grid(4)))
+        diffusion, noise = (axis.ravel() for axis in np.meshgrid(0.003 * 30.0 ** _grid(8), 0.8 * 1.6 ** _grid(4)))
         zero = np.zeros_like(noise)
         return cls(zero + np.inf, zero + 1.0, zero, diffusion, zero, noise)
 
@@ -175,12 +175,12 @@ def filter_series(courses: Courses, scaled: ScaledSeries) -> tuple[FloatArray, F
         P[1, 1] += walk[k]
         gain, expected = P[0].copy(), x[0].copy()
         h = scaled.inputs[:, k].tolist()
-        for i, each in enumerate(h, start=2):
-            gain += each * P[i]
-            expected += each * x[i]
+        for i, weight in enumerate(h, start=2):
+            gain += weight * P[i]
+            expected += weight * x[i]
         S = gain[0] + scaled.R[k] * R
-        for i, each in enumerate(h, start=2):
-            S += each * gain[i]
+        for i, weight in enumerate(h, start=2):
+            S += weight * gain[i]
         e = y - expected
         log_likelihood -= 0.5 * (e * e / S + np.log(S))
         x += gain * (e / S)

@@ -12,12 +12,13 @@ from servoscope.baseline.arm import ArmBaseline
 from servoscope.core.messages import translate
 from servoscope.diagnosis.arm import ArmExamination
 from servoscope.diagnosis.result import Diagnosis
-from servoscope.report.page import render_page, say, write_page
+from servoscope.report.diagnosis_document import LABELS, diagnosis_document
+from servoscope.report.document import DETAILS, EVIDENCE, PicturePart, Section, to_html
+from servoscope.report.format_values import format_clock_time
+from servoscope.report.page import ResultTable, say, write_page
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-LABELS = {"fault": "Fault", "healthy": "Healthy", "undetermined": "Undetermined"}
 
 
 def write_arm_page(path: str | Path, diagnosis: Diagnosis, examination: ArmExamination, baseline: ArmBaseline) -> None:
@@ -29,19 +30,25 @@ def render_arm_page(diagnosis: Diagnosis, examination: ArmExamination, baseline:
     """Return the page; it needs nothing from outside, no script and no network."""
     from servoscope.report.plotting import render_svg  # late: matplotlib takes half a second to import
 
-    figures = [
-        ("The arm and its joints", say("arm.page_joints"), plot_arm(**examination.picture(baseline, diagnosis))),
-        ("Torque from outside or unexplained", say("arm.page_torque"), plot_torque(examination, baseline, diagnosis)),
-    ]
-    return render_page(
-        "arm.html",
+    torque = plot_torque(examination, baseline, diagnosis)
+    drawn = {"arm": plot_arm(**examination.picture(baseline, diagnosis)), "torque": torque}
+    recordings = ", ".join(source.name for source in baseline.sources)
+    origin = ResultTable(
+        ("Quantity", "Value"), [(translate("baseline"), baseline.hash), (translate("recordings"), recordings)], words=2
+    )
+    return to_html(
+        (
+            *diagnosis_document(diagnosis),
+            Section("Torque from outside or unexplained", (PicturePart("torque"),), EVIDENCE, say("arm.page_torque")),
+            Section("Where this comes from", (origin,), DETAILS),
+        ),
+        {name: render_svg(figure, name) for name, figure in drawn.items()},
         title=f"{translate(LABELS[diagnosis.verdict])}: {diagnosis.recording}",
         kind=diagnosis.verdict,
         label=LABELS[diagnosis.verdict],
-        diagnosis=diagnosis,
-        name=baseline.loop.name,
-        figures=[(name, lead, render_svg(figure, f"a{i}")) for i, (name, lead, figure) in enumerate(figures)],
-        provenance={"baseline": baseline.hash, "recordings": ", ".join(source.name for source in baseline.sources)},
+        name=diagnosis.recording,
+        about=f"{translate('on')} {baseline.loop.name}",
+        size=[format_clock_time(diagnosis.duration_s)],
     )
 
 

@@ -277,9 +277,9 @@ def _warnings(d: Diagnosis, known: DiagnosisContext) -> tuple[Part, ...]:
         (when(w.from_s, w.to_s).replace("-", "−"), translate(fault_label(w.kind)), w.message, format_count(w.count))
         for w in warnings[:MAX_WARNINGS]
     ]
-    more = len(warnings) - MAX_WARNINGS
-    rest = (Notes((say("report.more", count=format_count(more), where=None),)),) if more > 0 else ()
-    return (ResultTable(("Time [s]", "Kind", "What happened", "Rows"), rows, words=3), *rest) if rows else ()
+    surplus = len(warnings) - MAX_WARNINGS
+    note = (Notes((say("report.more", count=format_count(surplus), where=None),)),) if surplus > 0 else ()
+    return (ResultTable(("Time [s]", "Kind", "What happened", "Rows"), rows, words=3), *note) if rows else ()
 
 
 def _reasons(d: Diagnosis) -> tuple[Notes, ...]:

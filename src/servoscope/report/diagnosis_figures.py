@@ -304,14 +304,14 @@ def plot_fault_sizes(diagnosis: Diagnosis) -> Figure | None:
 
 
 @plot_style()
-def _single(one: FaultEstimate, other: FaultEstimate | None) -> Figure:
+def _single(estimate: FaultEstimate, other: FaultEstimate | None) -> Figure:
     figure = Figure(figsize=(WIDTH, 1.25 if other is not None else 1.0), layout="constrained")
     ax = figure.subplots()
-    shown = [("refit", one, MEASURED), *([("recursion", other, HEALTHY)] if other is not None else [])]
+    shown = [("refit", estimate, MEASURED), *([("recursion", other, HEALTHY)] if other is not None else [])]
     for i, (_, fault, colour) in enumerate(shown):
         _interval(ax, fault, -i, colour)
     ax.set_yticks([-i for i in range(len(shown))], [name for name, _, _ in shown])
-    _size_axis(ax, one, 0.6 - len(shown), 0.6)
+    _size_axis(ax, estimate, 0.6 - len(shown), 0.6)
     return figure
 
 

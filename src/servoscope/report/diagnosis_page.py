@@ -199,7 +199,7 @@ def _format_setting(value: Any) -> str:
     if isinstance(value, int | float):
         return format_quantity(value)
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} = {_format_setting(each)}" for key, each in value.items())
+        return ", ".join(f"{key} = {_format_setting(item)}" for key, item in value.items())
     if isinstance(value, list | tuple):
         return ", ".join(map(_format_setting, value)) or "none"
     return str(value)

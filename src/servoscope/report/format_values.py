@@ -172,9 +172,9 @@ def format_clock_time(seconds: float, decimals: int = 1) -> str:
     text = _true_minus(f"{seconds:.{decimals}f}") + " s"
     if not 600.0 <= seconds < math.inf:
         return text
-    minutes, rest = divmod(round(seconds), 60)
+    minutes, left = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{text} ({f'{hours} h ' if hours else ''}{minutes} min {rest} s)"
+    return f"{text} ({f'{hours} h ' if hours else ''}{minutes} min {left} s)"
 
 
 def format_duration(seconds: float | None) -> str:

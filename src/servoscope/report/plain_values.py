@@ -78,9 +78,9 @@ def to_plain_values(record: BaseModel) -> object:
 def replace_nan(value: Any) -> Any:
     """Return plain values in which what is not a number is None."""
     if isinstance(value, dict):
-        return {key: replace_nan(each) for key, each in value.items()}
+        return {key: replace_nan(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [replace_nan(each) for each in value]
+        return [replace_nan(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -91,12 +91,12 @@ def provenance(baseline: Baseline, file: Path | str, recording: Path | str) -> d
     from servoscope import __version__
 
     sources = [source.name for source in baseline.sources]
-    more = f" and {len(sources) - 5} more" if len(sources) > 6 else ""
+    surplus = f" and {len(sources) - 5} more" if len(sources) > 6 else ""
     return {
         "recording": str(recording),
         "baseline": f"{file} ({baseline.hash})",
         **({"operating point": baseline.point} if baseline.point else {}),
-        "learned from": ", ".join(sources if not more else sources[:5]) + more,
+        "learned from": ", ".join(sources if not surplus else sources[:5]) + surplus,
         "threshold": f"{baseline.thresholds.statistic:.4g}",
         "made with": f"servoscope {__version__}",
         "made at": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),

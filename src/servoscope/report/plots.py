@@ -135,14 +135,14 @@ def _draw_plotly(picture: Picture) -> Figure:
     figure = make_subplots(rows=len(picture.panels), cols=1, shared_xaxes=True, vertical_spacing=0.05)
     for row, panel in enumerate(picture.panels, 1):
         for line in panel.lines:
-            one = {"name": line.name, "showlegend": bool(line.name), "row": row, "col": 1}
+            style = {"name": line.name, "showlegend": bool(line.name), "row": row, "col": 1}
             if line.low is not None and line.high is not None:  # there and back
                 x, y = (np.concatenate([a, b[::-1]]) for a, b in ((line.x, line.x), (line.low, line.high)))
                 band = {"line_width": 0, "fill": "toself", "hoverinfo": "skip", "opacity": 0.3}
-                figure.add_scatter(x=x, y=y, **one | band | {"name": "95 %", "mode": "lines", "showlegend": False})
+                figure.add_scatter(x=x, y=y, **style | band | {"name": "95 %", "mode": "lines", "showlegend": False})
             spread = {} if line.half_width is None else {"error_x": {"type": "data", "array": line.half_width}}
             mode = "markers" if spread else "lines+markers" if line.marks else "lines"
-            figure.add_scatter(x=line.x, y=line.y, mode=mode, **spread, **one)
+            figure.add_scatter(x=line.x, y=line.y, mode=mode, **spread, **style)
         if panel.limit:
             figure.add_hline(1.0, line_dash="dash", row=row, col=1)
         if panel.healthy:
@@ -168,10 +168,10 @@ def _recording(thing: Recording) -> Picture:
 @_picture.register(Trace)
 def _trace(thing: Trace) -> Picture:
     lines = []
-    for one in thing.statistics:
-        shown = np.where(thing.ready & (one.value > 0.0), one.value / one.limit, np.nan)
+    for statistic in thing.statistics:
+        shown = np.where(thing.ready & (statistic.value > 0.0), statistic.value / statistic.limit, np.nan)
         if np.isfinite(shown).any():
-            names = [one.name] if shown.ndim == 1 else [f"{one.name} of {i}" for i in range(len(shown))]
+            names = [statistic.name] if shown.ndim == 1 else [f"{statistic.name} of {i}" for i in range(len(shown))]
             lines += [Line(thing.t, y, name) for y, name in zip(np.atleast_2d(shown), names, strict=True)]
     return Picture("time [s]", [Panel(lines, "statistic over its limit", log_y=True, limit=True)])
 

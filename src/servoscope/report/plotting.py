@@ -158,9 +158,9 @@ def render_svg(figure: Figure, name: str) -> str:
     return text.replace("<svg", '<svg role="img"', 1)
 
 
-def _font(found: re.Match[str]) -> str:
-    weight = f"; font-weight: {found[1]}" if found[1] else ""
-    return f"font-size: {found[2]}{weight}"
+def _font(match: re.Match[str]) -> str:
+    weight = f"; font-weight: {match[1]}" if match[1] else ""
+    return f"font-size: {match[2]}{weight}"
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:

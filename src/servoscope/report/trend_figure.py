@@ -13,7 +13,7 @@ from servoscope.prognosis.series import NORMAL_95, SizeSeries
 from servoscope.report.plotting import COLOURS, plot_style, save_figure
 
 
-def draw_trend(series: SizeSeries, found: Prognosis) -> Figure:
+def draw_trend(series: SizeSeries, trend: Prognosis) -> Figure:
     """Return the picture: values with their 95 % intervals, limit, and the interval of the time until it."""
     figure = Figure(figsize=(7.2, 3.2), layout="constrained")
     axes = figure.add_subplot()
@@ -28,24 +28,24 @@ def draw_trend(series: SizeSeries, found: Prognosis) -> Figure:
         linewidth=0.8,
         color=COLOURS["ink"],
     )
-    axes.axhline(found.limit, color=COLOURS["alarm"], linewidth=1.0)
-    if found.outlook == "forecast" and found.remaining_s is not None and found.value is not None:
-        low, middle, high = found.remaining_s
+    axes.axhline(trend.limit, color=COLOURS["alarm"], linewidth=1.0)
+    if trend.outlook == "forecast" and trend.remaining_s is not None and trend.value is not None:
+        low, middle, high = trend.remaining_s
         assert low is not None, "a forecast has an earlier end"
         # an open end is drawn to the right border, half the history away
-        end = high if high is not None else max(2.0 * low, 0.5 * (found.to_t - found.from_t))
-        axes.axvspan((found.to_t + low) / DAY_S, (found.to_t + end) / DAY_S, color=COLOURS["alarm"], alpha=0.15, lw=0)
+        end = high if high is not None else max(2.0 * low, 0.5 * (trend.to_t - trend.from_t))
+        axes.axvspan((trend.to_t + low) / DAY_S, (trend.to_t + end) / DAY_S, color=COLOURS["alarm"], alpha=0.15, lw=0)
         if middle is not None:
-            way = np.array([found.to_t, found.to_t + middle]) / DAY_S
-            axes.plot(way, [found.value[1], found.limit], "--", color=COLOURS["muted"])
+            way = np.array([trend.to_t, trend.to_t + middle]) / DAY_S
+            axes.plot(way, [trend.value[1], trend.limit], "--", color=COLOURS["muted"])
     locator = AutoDateLocator()  # type: ignore[no-untyped-call]
     axes.xaxis.set_major_locator(locator)
     axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
-    axes.set(ylabel=found.name, title=found.summary)
+    axes.set(ylabel=trend.name, title=trend.summary)
     return figure
 
 
-def write_trend_figure(path: Path, series: SizeSeries, found: Prognosis) -> None:
+def write_trend_figure(path: Path, series: SizeSeries, trend: Prognosis) -> None:
     """Write the picture; the suffix of the path is its format."""
     with plot_style():
-        save_figure(draw_trend(series, found), path)
+        save_figure(draw_trend(series, trend), path)

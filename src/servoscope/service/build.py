@@ -234,6 +234,10 @@ def _check_covariates(config: ServiceFile, name: str, baseline: AnyBaseline) -> 
     """Raise ConfigError if an asset's source does not carry what its baseline depends on."""
     asset = config.assets[name]
     source, key = config.sources[asset.source], config.sources[asset.source].asset_key
+    apart = asset.nodes is not None and asset.nodes.block is None
+    apart |= (payload := getattr(source, "payload", None)) is not None and payload.has_signal_names
+    if apart and isinstance(baseline, ArmBaseline):
+        raise ConfigError(f"[assets] {name}: an arm needs all joints in one message, which source {asset.source} lacks")
     address = getattr(asset, key) if key else None
     lacking = [
         logged_covariate

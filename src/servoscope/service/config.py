@@ -168,9 +168,9 @@ class ServiceFile(FileSettings):
             "actions": self.actions.with_service_name(self.name, name),
             "web": None,
         }
-        found = self.model_copy(update=update)
-        found._shard = number
-        return found
+        shard = self.model_copy(update=update)
+        shard._shard = number
+        return shard
 
     def load_again(self, path: Path) -> Self:
         """Read the service file once more, and return the same part of it."""
@@ -179,13 +179,13 @@ class ServiceFile(FileSettings):
     def check_fixed(self, new: ServiceFile) -> None:
         """Refuse a change of what a service cannot change while it runs."""
 
-        def fixed(one: ServiceFile) -> dict[str, Any]:
+        def fixed(file: ServiceFile) -> dict[str, Any]:
             return {
-                "name": one.name,
-                "[service] listen": one.service.listen,
-                "[service] workers": one.service.workers,
-                "[store] url": one.store.url,
-                "[web]": one.web,
+                "name": file.name,
+                "[service] listen": file.service.listen,
+                "[service] workers": file.service.workers,
+                "[store] url": file.store.url,
+                "[web]": file.web,
             }
 
         for place, value in fixed(self).items():
@@ -210,13 +210,13 @@ class ServiceFile(FileSettings):
 
     def _check_identities(self) -> None:
         """Refuse two clients of one name: a broker throws out one for the other, and messages are lost."""
-        found: dict[str, str] = {}
+        places: dict[str, str] = {}
         for (section, name), client in self.client_names().items():
             settings: SourceSettings | PublisherSettings = getattr(self, section)[name]
             place, identity = f"[{section}] {name}", settings.identity(client)
-            if identity and identity in found:
-                raise ValueError(f"{place}: {identity} is that of {found[identity]} too, give each one of its own")
-            found[identity] = place
+            if identity and identity in places:
+                raise ValueError(f"{place}: {identity} is that of {places[identity]} too, give each one of its own")
+            places[identity] = place
 
     def _check_sharing(self) -> None:
         """Refuse what several processes cannot have at the same time."""

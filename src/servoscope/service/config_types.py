@@ -114,11 +114,11 @@ class FileSettings(Settings):
     def parse(cls, text: str, path: Path) -> Self:
         """Return what a text says that is the file of a path, or will be; raises ConfigError as `load` does."""
         try:
-            found = cls.model_validate(parse_toml(text, path, ConfigError))
+            settings = cls.model_validate(parse_toml(text, path, ConfigError))
         except ValidationError as error:
             raise ConfigError(f"{path}: {describe_error(error, cls)}") from None
-        found._file = path.absolute()
-        return found
+        settings._file = path.absolute()
+        return settings
 
     @property
     def folder(self) -> Path:

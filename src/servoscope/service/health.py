@@ -59,8 +59,8 @@ class HealthReport:
         return None
 
 
-def _json_answer(ok: bool, more: Mapping[str, object]) -> HealthAnswer:
-    return HealthAnswer(200 if ok else 503, json.dumps({"ok": ok, **more}).encode(), "application/json")
+def _json_answer(ok: bool, headers: Mapping[str, object]) -> HealthAnswer:
+    return HealthAnswer(200 if ok else 503, json.dumps({"ok": ok, **headers}).encode(), "application/json")
 
 
 def status_gauges(statuses: Iterable[tuple[str, AssetStatus]]) -> Iterator[Metric]:

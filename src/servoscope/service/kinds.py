@@ -29,7 +29,11 @@ S = TypeVar("S", bound=Settings)
 
 def find_kinds(group: str) -> dict[str, EntryPoint]:
     """Return the entry points of a group by kind; a package cannot replace a built-in kind."""
-    return {each.name: each for each in (*entry_points(group=group), *BUILT_IN) if each.group == group}
+    return {
+        entry_point.name: entry_point
+        for entry_point in (*entry_points(group=group), *BUILT_IN)
+        if entry_point.group == group
+    }
 
 
 def parse_tables(tables: Any, group: str, base: type[S], section: str) -> Any:
@@ -52,13 +56,13 @@ def _parse_table(table: Any, group: str, base: type[S], place: str) -> Any:
     if not isinstance(kind, str) or kind not in kinds:
         raise ValueError(f"{place}.kind: {kind!r} is unknown, choose from {', '.join(sorted(kinds))}")
     try:
-        found = kinds[kind].load()
+        model = kinds[kind].load()
     except Exception as error:  # another package's
         raise ValueError(f"{place}.kind: {kind!r} cannot be loaded ({type(error).__name__}: {error})") from None
-    if not (isinstance(found, type) and issubclass(found, base)):
+    if not (isinstance(model, type) and issubclass(model, base)):
         raise ValueError(f"{place}.kind: {kind!r} is no subclass of {base.__name__}, correct {kinds[kind].value}")
     try:
-        return found.model_validate(table)
+        return model.model_validate(table)
     except ValidationError as error:
-        text = describe_error(error, found)
+        text = describe_error(error, model)
         raise ValueError(f"{place}{'.' if error.errors()[0]['loc'] else ': '}{text}") from None

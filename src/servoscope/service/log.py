@@ -18,9 +18,9 @@ LIBRARIES = ("psycopg", "asyncua")  # they log lost connections themselves
 def _hide(value: object) -> object:
     """Return a value as JSON takes it, without the secrets of addresses."""
     if isinstance(value, Mapping):
-        return {key: _hide(one) for key, one in value.items()}
+        return {key: _hide(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_hide(one) for one in value]
+        return [_hide(item) for item in value]
     return value if isinstance(value, bool | int | float | None) else hide_secrets(str(value))
 
 

@@ -83,9 +83,9 @@ class ServiceMetrics:
         places = np.bincount(np.searchsorted(BUCKETS_S, latencies), minlength=len(BUCKETS_S) + 1)
         self._latencies = self._latencies[0] + places, self._latencies[1] + float(latencies.sum())
 
-    def record_rejection(self, source: str, one: Rejection) -> None:
+    def record_rejection(self, source: str, rejection: Rejection) -> None:
         """Count messages that could not be used."""
-        self._rejections.labels(source, one.asset, one.kind).inc(one.count)
+        self._rejections.labels(source, rejection.asset, rejection.kind).inc(rejection.count)
 
     def render(self) -> bytes:
         """Return all of them in the format of Prometheus."""

@@ -96,8 +96,8 @@ T = TypeVar("T", bound=Settings)
 def apply_network(tables: Mapping[str, T], network: NetworkSettings) -> dict[str, T]:
     """Return tables in which those that connect to somebody have rules."""
 
-    def apply(one: T) -> T:
-        is_open = isinstance(one, ConnectionSettings) and one.network is None
-        return one.model_copy(update={"network": network}) if is_open else one
+    def apply(settings: T) -> T:
+        is_open = isinstance(settings, ConnectionSettings) and settings.network is None
+        return settings.model_copy(update={"network": network}) if is_open else settings
 
     return {name: apply(table) for name, table in tables.items()}

@@ -58,8 +58,8 @@ class Notifier:
         if plain["version"] != VERSION:
             raise StateError(f"{self.name}: its saved state is of another version: use that one, or {hint}")
         self._rows, self._flood = plain["rows"], FloodState.from_dict(plain["flood"])
-        self._service_alarms = {name: AlarmState.from_dict(one) for name, one in plain["own"].items()}
-        self._tolerance = {name: FaultToleranceState.from_dict(one) for name, one in plain["tolerance"].items()}
+        self._service_alarms = {name: AlarmState.from_dict(alarm) for name, alarm in plain["own"].items()}
+        self._tolerance = {name: FaultToleranceState.from_dict(state) for name, state in plain["tolerance"].items()}
 
     def checkpoint(self) -> dict[str, Any]:
         """Return its row for the store."""
@@ -138,8 +138,8 @@ class Notifier:
             return []
         if any(held_alarm.key == (alarm.asset, FAULT_ALARM) for held_alarm in self._flood.held):
             return []
-        found = {"verdict": diagnosis.verdict, "diagnosis": diagnosis.summary, "onset": diagnosis.onset}
-        details = {**self._advice(FAULT_ALARM), **found, "faults": diagnosis.document.get("faults", [])}
+        outcome = {"verdict": diagnosis.verdict, "diagnosis": diagnosis.summary, "onset": diagnosis.onset}
+        details = {**self._advice(FAULT_ALARM), **outcome, "faults": diagnosis.document.get("faults", [])}
         details["checks"] = diagnosis.document.get("checks", [])
         priority = self._alarms.definitions[FAULT_ALARM].priority
         sent = actions.diagnosis_entries(self._settings, alarm, priority, t, now, diagnosis.summary, details)
@@ -155,7 +155,7 @@ class Notifier:
         self._service_alarms, transitions = own, list[AlarmTransition]()
         for name, definition in self._alarms.service_alarms.items():
             if definition.source == "connection":
-                snapshots = {f"{name}.{one}": AssetSnapshot(connection=why) for one, why in troubles.items()}
+                snapshots = {f"{name}.{source}": AssetSnapshot(connection=why) for source, why in troubles.items()}
             else:
                 cause = render(message("alarm.cause_buffer", share=fill_ratio))
                 snapshots = {name: AssetSnapshot(buffered=fill_ratio, cause=cause)}
@@ -207,11 +207,11 @@ class Notifier:
                 rows.append(self._outbox_row(entry))
         return rows
 
-    def _outbox_row(self, one: OutboxEntry) -> TableRow:
+    def _outbox_row(self, entry: OutboxEntry) -> TableRow:
         """Return the row of an entry; the keys of two services on one store must differ."""
-        key = actions.idempotency_key(self.name, one.key)
-        event = {**one.event, "key": key, "service": self.name}
-        sink, asset = self._settings.sinks.get(one.sink), event.get("asset")
+        key = actions.idempotency_key(self.name, entry.key)
+        event = {**entry.event, "key": key, "service": self.name}
+        sink, asset = self._settings.sinks.get(entry.sink), event.get("asset")
         if sink is not None and sink.address is not None:  # alarms of the service itself have no page of their own
             event["link"] = page_address(sink.address, asset if asset != self.name else None)
-        return TableRow("outbox", {**one.to_dict(), "key": key, "event": event, "outcome": ""})
+        return TableRow("outbox", {**entry.to_dict(), "key": key, "event": event, "outcome": ""})

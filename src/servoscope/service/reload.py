@@ -87,7 +87,7 @@ def reload_components(
     outlets = [name for name, publisher in publishers.items() if publisher is not running.publishers.get(name)]
     for name in outlets:
         try:
-            publishers[name].open({each: row["status"] for each, row in rows.items()})
+            publishers[name].open({asset_name: row["status"] for asset_name, row in rows.items()})
         except ServoscopeError as error:  # an address in use, for example: no reason to follow nothing
             log("error", "outlet cannot be opened", outlet=name, why=str(error))
     changes = {
@@ -108,5 +108,7 @@ def _identity(config: ServiceFile, assets: Mapping[str, Asset], name: str) -> tu
 
 def _source_identity(config: ServiceFile, assets: Mapping[str, Asset], name: str) -> tuple[Any, ...]:
     """Return all on which a source depends."""
-    own = {each: (asset.loop.hash(), *asset[1:]) for each, asset in source_assets(config, assets, name).items()}
+    own = {
+        asset_name: (asset.loop.hash(), *asset[1:]) for asset_name, asset in source_assets(config, assets, name).items()
+    }
     return config.sources[name], own

@@ -87,12 +87,12 @@ def offers(baseline: Baseline, status: AssetStatus, kept_s: float) -> list[Messa
     if status.verdict != "healthy" or status.learning is not None or healthy_s < min(MIN_LEARN_S, kept_s):
         return []
     messages = [message("service.renewal.ready", minutes=healthy_s / 60.0)]
-    for more in OFFERED_RECORDINGS:
-        changes = forecast_changes(baseline, more)
-        name = min(changes, key=lambda each: changes[each][1] / changes[each][0], default="")
+    for recordings in OFFERED_RECORDINGS:
+        changes = forecast_changes(baseline, recordings)
+        name = min(changes, key=lambda fault: changes[fault][1] / changes[fault][0], default="")
         if name and changes[name][1] < MAX_OFFERED_RATIO * changes[name][0]:
             before, after = (100.0 * size for size in changes[name])
-            messages.append(message("service.renewal.offer", more=more, fault=name, before=before, after=after))
+            messages.append(message("service.renewal.offer", more=recordings, fault=name, before=before, after=after))
     return [*messages, *asked]
 
 

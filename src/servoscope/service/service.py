@@ -71,7 +71,7 @@ class Service:
         self.sources, self.store, self._publishers = components.sources, components.store, components.publishers
         self.assets, self.notifier, self._groups = components.assets, components.notifier, components.groups
         # those of which a full diagnosis may be pending, in order
-        self._awaiting = {name: None for name, one in self.assets.items() if one.pending_diagnoses}
+        self._awaiting = {name: None for name, asset in self.assets.items() if asset.pending_diagnoses}
 
     def reload(self, path: Path) -> None:
         """Change to what the service file says now, soon; for a signal's handler or another thread."""
@@ -121,7 +121,7 @@ class Service:
         finally:
             self.dispatcher.stop()
             self._diagnosis_worker.close()
-            for close in [one.close for kind in (self.sources, self._publishers) for one in kind.values()]:
+            for close in [component.close for kind in (self.sources, self._publishers) for component in kind.values()]:
                 close()
             self.store.close()
         log("info", "stopped", service=self.config.name, why=self._stop_reason)
@@ -198,11 +198,11 @@ class Service:
     def _process_blocks(self, source: Inbox, blocks: Sequence[Block]) -> None:
         # recordings are dated as they like
         latest = self.clock.latest() + self.config.service.ahead_s if source.clock_rate == 1.0 else math.inf
-        for found in self._groups.process(blocks, latest):
-            if isinstance(found, QuietBlocks):
-                self._store_quiet(found)
+        for outcome in self._groups.process(blocks, latest):
+            if isinstance(outcome, QuietBlocks):
+                self._store_quiet(outcome)
                 continue
-            block, result = found
+            block, result = outcome
             asset = self.assets[block.asset]
             if asset.pending_diagnoses:
                 self._awaiting[asset.name] = None
@@ -219,13 +219,13 @@ class Service:
             self.handle_result(asset, result)
             self.writer.set_checkpoint(asset, block.completed_at, can_wait=result.repeatable)
 
-    def _store_quiet(self, found: QuietBlocks) -> None:
-        for asset, (number, *_, samples, regular) in zip(found.assets, found.packed, strict=True):
+    def _store_quiet(self, quiet: QuietBlocks) -> None:
+        for asset, (number, *_, samples, regular) in zip(quiet.assets, quiet.packed, strict=True):
             self.writer.add_block(asset.name, number, samples, regular)
             self._receptions[asset.name].hear(self._listening.seconds)
-        for place, row in found.history:
-            self.writer.add(found.assets[place].name, [row])
-        self.writer.set_checkpoints(found.assets, [one.completed_at for one in found.blocks])
+        for place, row in quiet.history:
+            self.writer.add(quiet.assets[place].name, [row])
+        self.writer.set_checkpoints(quiet.assets, [block.completed_at for block in quiet.blocks])
 
     def handle_result(self, asset: Asset, result: StepResult) -> None:
         """Store and announce what a step of an asset has led to."""
@@ -233,11 +233,12 @@ class Service:
         if not result.transitions or asset.state is None:
             return
         now, examination = self.clock.now(), asset.state.examination
-        for one in result.transitions:
-            words = {"asset": one.asset, "alarm": one.alarm, "before": str(one.before), "after": str(one.after)}
-            log("info", "alarm", **words, cause=one.cause, who=one.who, t=one.time)
-            if one.alarm == "fault" and one.event == "clear":
-                self.writer.add(self.config.name, self.notifier.accommodate_fault(asset.name, None, one.time, now))
+        for transition in result.transitions:
+            words = {name: str(getattr(transition, name)) for name in ("asset", "alarm", "before", "after")}
+            log("info", "alarm", **words, cause=transition.cause, who=transition.who, t=transition.time)
+            if transition.alarm == "fault" and transition.event == "clear":
+                rows = self.notifier.accommodate_fault(asset.name, None, transition.time, now)
+                self.writer.add(self.config.name, rows)
         details = {"diagnosis": examination.summary, "onset": examination.onset}
         self.writer.add(self.config.name, self.notifier.notify(result.transitions, details, now))
 
@@ -273,13 +274,13 @@ class Service:
             elif job is not None and job.done():
                 del self._prognosis_jobs[name]
                 try:
-                    found = job.result()
+                    prognosis = job.result()
                 except ServoscopeError as error:  # nothing stored yet, or the store is away
                     self._prognosis_from[name] = now + PROGNOSIS_RETRY_S
                     log("debug", "no prognosis", asset=name, why=str(error))
                     continue
-                log("info", "prognosis", asset=name, summary=found.summary)
-                self.handle_result(asset, asset.apply_prognosis(found))
+                log("info", "prognosis", asset=name, summary=prognosis.summary)
+                self.handle_result(asset, asset.apply_prognosis(prognosis))
                 self.writer.set_checkpoint(asset)
 
     def note_refusal(self, name: str, why: str) -> None:
@@ -381,7 +382,7 @@ class Service:
         # what is measured now is gathered for a while, unless each block is to be stored soon, or a turn was full
         gather_s = min(MIN_TURN_S, 0.5 * self.config.service.commit_every_s) if not self._is_behind else 0.0
         rest_s = max(0.0, self.last_turn + gather_s - now)
-        nexts = (max(one.next_block_s, rest_s * (one.clock_rate == 1.0)) for one in self.sources.values())
+        nexts = (max(source.next_block_s, rest_s * (source.clock_rate == 1.0)) for source in self.sources.values())
         due = min(nexts, default=math.inf) if self.writer.free else math.inf  # none: a worker that lost its last asset
         return min(due, max(MAX_PAUSE_S, rest_s), max(0.0, self._next_commit - now))
 

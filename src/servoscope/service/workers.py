@@ -77,7 +77,7 @@ class _Follower:
 
     def _command(self) -> list[str]:
         self._address, self.has_begun = "", False
-        anew = [part for one in self._anew for part in ("--anew", one)]
+        anew = [part for name in self._anew for part in ("--anew", name)]
         return ["run", str(self._path), "--worker", str(self.number), *anew]
 
     def _take_address(self, line: str) -> None:
@@ -129,13 +129,13 @@ class WorkerPool:
         )
 
     def _ask_all(self, path: str) -> list[bytes]:
-        found = []
+        answers = []
         for worker in self._workers:
             try:
-                found.append(worker.ask(path))
+                answers.append(worker.ask(path))
             except OSError:
                 continue  # its supervisor starts it again; readiness says so
-        return found
+        return answers
 
     def _why(self, key: str) -> str:
         whys = []
@@ -216,7 +216,7 @@ class WorkerPool:
         restarted, self.restarted = self.restarted, ()  # once
         for number in sorted(self.config.shard_numbers() - running):
             own = {*self.config.shard(number).assets, self.config.shard_name(number)}
-            worker = _Follower(self.config, self.path, number, [one for one in restarted if one in own], files)
+            worker = _Follower(self.config, self.path, number, [name for name in restarted if name in own], files)
             self._workers.append(worker)
             worker.supervisor.start()
 

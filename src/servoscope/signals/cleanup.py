@@ -209,9 +209,9 @@ def _find_spikes(
     with outofcore.second_thread(y.size) as pool:
         y_search = pool.submit(find_spikes, y, run, share=SPIKE_SHARES["y"])
         in_r, in_u = _find_input_spikes(r, u, run)
-    found = in_r, in_u, y_search.result()
-    spiky = [label for label, rows in zip(labels, found, strict=True) if rows.size]
-    return _union(*found), spiky
+    spikes = in_r, in_u, y_search.result()
+    spiky = [label for label, rows in zip(labels, spikes, strict=True) if rows.size]
+    return _union(*spikes), spiky
 
 
 def _find_input_spikes(r: FloatArray, u: FloatArray, run: Int32Array) -> tuple[IndexArray, IndexArray]:

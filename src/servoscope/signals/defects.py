@@ -54,7 +54,7 @@ def limit_defects(defects: list[Defect]) -> list[Defect]:
     """Return the defects, of one kind, with those past the first hundred summed up in the last."""
     if len(defects) <= MAX_DEFECTS:
         return defects
-    rest = defects[MAX_DEFECTS - 1 :]
-    count, end = sum(defect.count for defect in rest), rest[-1].to_s
-    text = message("defect.more", events=len(rest), rows=count, to_s=end)
-    return [*defects[: MAX_DEFECTS - 1], Defect(rest[0].kind, rest[0].from_s, end, count, text)]
+    surplus = defects[MAX_DEFECTS - 1 :]
+    count, end = sum(defect.count for defect in surplus), surplus[-1].to_s
+    text = message("defect.more", events=len(surplus), rows=count, to_s=end)
+    return [*defects[: MAX_DEFECTS - 1], Defect(surplus[0].kind, surplus[0].from_s, end, count, text)]

@@ -113,6 +113,6 @@ def thin_out(recording: Recording, rows: int, shortest: int) -> Recording:
     return part
 
 
-def with_defects(recording: Recording, *more: Defect) -> Recording:
+def with_defects(recording: Recording, *added: Defect) -> Recording:
     """Return the recording with further defects, all in the order of time."""
-    return replace(recording, defects=tuple(sorted((*recording.defects, *more), key=lambda defect: defect.from_s)))
+    return replace(recording, defects=tuple(sorted((*recording.defects, *added), key=lambda defect: defect.from_s)))

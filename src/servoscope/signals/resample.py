@@ -92,7 +92,7 @@ def resample_rows(
     cuts = np.flatnonzero(apart | ~within) + 1
     usual = float(np.median(steps[within & ~apart]))
     begins, ends = np.append(0, cuts), np.append(cuts, t.size)
-    found: list[tuple[FloatArray, int, list[FloatArray]]] = []
+    stretches: list[tuple[FloatArray, int, list[FloatArray]]] = []
     origin = {int(run[first]): float(t[first]) for first in begins[::-1]}  # the first row of each run
     for first, end in zip(begins.tolist(), ends.tolist(), strict=True):
         if end - first < 4:  # a cubic needs four points
@@ -108,14 +108,14 @@ def resample_rows(
                 _resample_stretch(t[rows], x[rows], grid, target, usual, index in inputs)
                 for index, x in enumerate(columns)
             ]
-            found.append((grid, int(run[first]) if begin == low else -1 - int(run[first]), new))
-    if not found:
+            stretches.append((grid, int(run[first]) if begin == low else -1 - int(run[first]), new))
+    if not stretches:
         raise RecordingError(f"{name}: falls into stretches of under four rows, too short to resample")
-    grid = np.concatenate([each for each, *_ in found])
-    runs = np.concatenate([np.full(each.size, k if k >= 0 else -1 - k, np.int32) for each, k, _ in found])
+    grid = np.concatenate([times for times, *_ in stretches])
+    runs = np.concatenate([np.full(times.size, k if k >= 0 else -1 - k, np.int32) for times, k, _ in stretches])
     restart = np.zeros(grid.size, dtype=np.bool_)
-    restart[np.cumsum([0, *(each.size for each, *_ in found)])[:-1]] = [k >= 0 for _, k, _ in found]
-    merged = [np.concatenate([new[index] for *_, new in found]) for index in range(len(columns))]
+    restart[np.cumsum([0, *(times.size for times, *_ in stretches)])[:-1]] = [k >= 0 for _, k, _ in stretches]
+    merged = [np.concatenate([new[index] for *_, new in stretches]) for index in range(len(columns))]
     bridged = float(steps[within & ~apart].max())
     return UniformRows(grid, runs, restart, merged, target.error(bridged), np.flatnonzero(apart))
 
@@ -136,13 +136,15 @@ def _resample_stretch(
     # what folds back to below the cutoff has to go first: frequencies from rate - cutoff on
     finer = math.ceil(period / usual) if 0.5 / usual > target.rate - target.cutoff else 1
     if finer == 1:
-        found = spline(np.clip(wanted, knots[0], knots[-1]))
+        samples = spline(np.clip(wanted, knots[0], knots[-1]))
     else:
         fine = wanted[0] + np.arange(grid.size * finer) * (period / finer)
-        found = signal.resample_poly(spline(np.clip(fine, knots[0], knots[-1])), 1, finer, padtype="line")[: grid.size]
-    if held and found.size > 2:
+        samples = signal.resample_poly(spline(np.clip(fine, knots[0], knots[-1])), 1, finer, padtype="line")[
+            : grid.size
+        ]
+    if held and samples.size > 2:
         # a hold over h damps by 1 - (omega h)^2/24 (a straight line between samples twice that); the new one makes up
         # for the difference
         share = (1.0 if middle else 2.0) / 24.0 * (1.0 - (usual / period) ** 2)
-        found[1:-1] -= share * np.diff(found, 2)
-    return np.asarray(found, dtype=np.float64)
+        samples[1:-1] -= share * np.diff(samples, 2)
+    return np.asarray(samples, dtype=np.float64)

@@ -53,10 +53,10 @@ def find_spikes(
         def logged(rows: IndexArray, before: IndexArray = before) -> IndexArray:
             return np.asarray(rows + np.searchsorted(before, rows, side="right"))
 
-        found = logged(_find_spikes_once(z, runs, share, lambda rows, logged=logged: excused(logged(rows))))  # type: ignore[misc]
-        if not found.size:
+        higher = logged(_find_spikes_once(z, runs, share, lambda rows, logged=logged: excused(logged(rows))))  # type: ignore[misc]
+        if not higher.size:
             break
-        spikes = np.union1d(spikes, found)
+        spikes = np.union1d(spikes, higher)
     return spikes
 
 
@@ -107,8 +107,8 @@ def _is_quiet(x: FloatArray, run: npt.NDArray[np.int32], share: float) -> bool:
 
 
 def _range(x: FloatArray) -> tuple[float, float]:
-    each = [(float(x[rows].min()), float(x[rows].max())) for rows in outofcore.iter_chunks(0, x.size, x)]
-    return min(low for low, _ in each), max(high for _, high in each)
+    ranges = [(float(x[rows].min()), float(x[rows].max())) for rows in outofcore.iter_chunks(0, x.size, x)]
+    return min(low for low, _ in ranges), max(high for _, high in ranges)
 
 
 def _previous(x: npt.NDArray[Any], rows: slice) -> npt.NDArray[Any]:

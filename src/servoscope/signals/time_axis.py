@@ -199,7 +199,7 @@ def _sort_runs(
 
     Up to a row at which time goes backwards all is sorted: only rows later than it, and those that are late, move.
     """
-    found: list[tuple[int, IndexArray]] = []
+    stretches: list[tuple[int, IndexArray]] = []
     logged, done = t, 0
     t = outofcore.copy_column(t) if backwards.size else t
     for back in backwards.tolist():
@@ -212,12 +212,14 @@ def _sort_runs(
         while done < stop and t[done] < high:
             low, done = min(low, float(t[done])), done + 1
         first = begin + int(np.searchsorted(t[begin:back], low, side="right"))
-        while found and first <= found[-1][0] + found[-1][1].size:  # one stretch with what was sorted before
-            first = min(first, found.pop()[0])
+        while (
+            stretches and first <= stretches[-1][0] + stretches[-1][1].size
+        ):  # one stretch with what was sorted before
+            first = min(first, stretches.pop()[0])
         order = np.argsort(logged[first:done], kind="stable")
         t[first:done] = logged[first:done][order]
-        found.append((first, order))
-    return t, found
+        stretches.append((first, order))
+    return t, stretches
 
 
 def _measure_rate(

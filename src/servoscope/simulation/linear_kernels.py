@@ -209,9 +209,9 @@ def axis_constants(plants: Sequence[Plant], loop: Loop) -> AxisConstants:
         stiffness=stiffness,
         coulomb=coulomb,
         offset=offset,
-        stribeck=np.array([each.pop(Column.STRIBECK, (0.0, 0.0, 0.0))[:2] for each in columns]),
-        load=np.array([each.pop(Column.LOAD, (0.0, 0.0, 0.0)) for each in columns]),
-        waves=np.array([list(each.values()) for each in columns]).reshape(len(plants), -1, 3),
+        stribeck=np.array([terms.pop(Column.STRIBECK, (0.0, 0.0, 0.0))[:2] for terms in columns]),
+        load=np.array([terms.pop(Column.LOAD, (0.0, 0.0, 0.0)) for terms in columns]),
+        waves=np.array([list(terms.values()) for terms in columns]).reshape(len(plants), -1, 3),
         steps=SUB_STEPS,
         speed=bool(loop.plant.derivative),
     )

@@ -156,8 +156,8 @@ def simulate_rig(
         loop = loop.model_copy(update={"delay": rig.delay_samples / loop.sample_rate})
     events = resolve_faults(plant, faults)
     plan = schedule_plants(plant, events, r.size, loop.sample_rate)
-    for each, what in zip(plan.plants, describe_plants(plan), strict=True):
-        system = _prepend_valve(each.state_space(), rig)
+    for variant, what in zip(plan.plants, describe_plants(plan), strict=True):
+        system = _prepend_valve(variant.state_space(), rig)
         check_stable(loop, discretise(system, loop.sample_rate, delay=loop.delay), what)
     t = np.arange(r.size) / loop.sample_rate
     temperature = rig.temperature + rig.warming * -np.expm1(-t / rig.warming_time)

@@ -39,6 +39,12 @@ def closed_loop_poles(loop: Loop, plant: Plant | None = None) -> npt.NDArray[np.
     )
 
 
+def settling_samples(loop: Loop, plant: Plant, share: float) -> int:
+    """Return how many samples a loop takes until a share of its initial state is left; 0 where it never does."""
+    slowest = float(np.abs(closed_loop_poles(loop, plant)).max())
+    return int(np.ceil(np.log(share) / np.log(slowest))) if 0.0 < slowest < 1.0 else 0
+
+
 def discrete_closed_loop_poles(loop: Loop, discrete: DiscretePlant) -> npt.NDArray[np.complex128]:
     """Return the closed-loop poles of a plant that is discretised already.
 

@@ -152,8 +152,8 @@ def _file_response(path: Path) -> Response:
 class _NoCacheFiles(StaticFiles):
     """Files that a browser checks for changes each time: an update shows at once."""
 
-    def file_response(self, *args: object, **more: object) -> Response:
+    def file_response(self, *args: object, **options: object) -> Response:
         """Return a file, or the answer that it has not changed."""
-        response = super().file_response(*args, **more)  # type: ignore[arg-type]  # handed on as they come
+        response = super().file_response(*args, **options)  # type: ignore[arg-type]  # handed on as they come
         response.headers["Cache-Control"] = "no-cache"
         return response

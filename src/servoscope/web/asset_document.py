@@ -91,7 +91,7 @@ def _facts(status: AssetStatus, diagnosis: Diagnosis | None) -> Iterator[Fact]:
     elif fault and not faults:
         key = "report.check.waiting" if status.pending_diagnoses else "report.not_named"
         yield Fact("How large", translate("not known"), (say(key),))
-    found = quality.describe_findings(status.quality) if status.quality else ""
-    yield Fact("Data", translate("sound") if not found else say("report.quality", findings=found))
+    findings = quality.describe_findings(status.quality) if status.quality else ""
+    yield Fact("Data", translate("sound") if not findings else say("report.quality", findings=findings))
     if fault and max(status.statistic or 0.0, status.level or 0.0) < 1.0:
         yield Fact("Now", say("report.quiet"), (say("report.quiet_reason"),))

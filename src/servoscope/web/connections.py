@@ -116,8 +116,8 @@ class HttpProtocol(H11Protocol):
     BODY_RATE = 10_000.0  # bytes per second
     DRAIN_S = 60.0  # within which a client has to make room for more of an answer
 
-    def __init__(self, table: ConnectionTable, *args: Any, **more: Any) -> None:
-        super().__init__(*args, **more)
+    def __init__(self, table: ConnectionTable, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
         self._table = table
         self._phase = ""  # header, body, or none
         self._deadline = 0.0  # of the phase, by the clock of the loop [s]

@@ -80,7 +80,9 @@ def install_error_handlers(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(request: Request, error: RequestValidationError) -> Response:
-        errors = [{"where": ".".join(map(str, one["loc"])), "what": str(one["msg"])} for one in error.errors()]
+        errors = [
+            {"where": ".".join(map(str, problem["loc"])), "what": str(problem["msg"])} for problem in error.errors()
+        ]
         detail = f"{errors[0]['where']}: {errors[0]['what']}" if errors else render(message("web.invalid"))
         return problem_response(422, detail, request.url.path, errors)
 

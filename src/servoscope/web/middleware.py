@@ -162,11 +162,11 @@ def request_language(headers: Headers) -> str:
     """Return the language that a reader has chosen on the page, else the browser's, else the server's own."""
     chosen = _read_cookie(headers.getlist("cookie"), LANGUAGE_COOKIE)
     wanted = []
-    for each in headers.get("accept-language", "").split(","):
-        name, _, weight = each.partition(";q=")
+    for preference in headers.get("accept-language", "").split(","):
+        name, _, weight = preference.partition(";q=")
         with contextlib.suppress(ValueError):
             wanted.append((-float(weight or 1.0), name.strip()[:2].lower()))
-    asked = [chosen, *(name for _, name in sorted(wanted, key=lambda one: one[0]))]
+    asked = [chosen, *(name for _, name in sorted(wanted, key=lambda entry: entry[0]))]
     return next((name for name in asked if name in languages()), current_language())
 
 

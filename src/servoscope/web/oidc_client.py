@@ -96,10 +96,10 @@ class OidcClient:
         url = (await self._load_metadata()).get("userinfo_endpoint")
         if url is None:
             return {}
-        found = await self._get(url, {"Authorization": f"Bearer {token['access_token']}"})
-        if found.get("sub") != subject:  # else the token of one user could bring the groups of another
+        claims = await self._get(url, {"Authorization": f"Bearer {token['access_token']}"})
+        if claims.get("sub") != subject:  # else the token of one user could bring the groups of another
             raise self._problem(ValueError("its userinfo is of another user than its ID token"))
-        return found
+        return claims
 
     async def _load_metadata(self) -> dict[str, Any]:
         async with self._loading:  # nobody has logged in yet: many who ask must not become many requests to a provider
@@ -116,14 +116,14 @@ class OidcClient:
             return self._metadata
 
     async def _fetch_metadata(self) -> dict[str, Any]:
-        found = await self._get(self._settings.issuer.rstrip("/") + "/.well-known/openid-configuration")
-        if found.get("issuer") != self._settings.issuer:
+        metadata = await self._get(self._settings.issuer.rstrip("/") + "/.well-known/openid-configuration")
+        if metadata.get("issuer") != self._settings.issuer:
             raise self._problem(ValueError("it names itself otherwise: issuer must be written as it does"))
         secure = urlsplit(self._settings.issuer).scheme
-        for name in (*ENDPOINTS, *({"userinfo_endpoint"} & found.keys())):
-            if not str(found.get(name, "")).startswith(("https://", f"{secure}://")):
+        for name in (*ENDPOINTS, *({"userinfo_endpoint"} & metadata.keys())):
+            if not str(metadata.get(name, "")).startswith(("https://", f"{secure}://")):
                 raise self._problem(ValueError(f"its {name} is missing, or not https"))
-        return found
+        return metadata
 
     async def _load_keys(self, *, renew: bool = False) -> KeySet:
         if self._keys is None or (renew and time.monotonic() >= self._keys_after):
@@ -136,12 +136,12 @@ class OidcClient:
         try:
             async with httpx.AsyncClient(timeout=self._settings.timeout_s) as client:
                 answer = await client.get(url, headers=headers)
-                found = answer.raise_for_status().json()
+                document = answer.raise_for_status().json()
         except (httpx.HTTPError, httpx.InvalidURL, ValueError) as error:
             raise self._problem(error) from None
-        if not isinstance(found, dict):
+        if not isinstance(document, dict):
             raise self._problem(ValueError("its answer is no table"))
-        return found
+        return document
 
     def _session(self) -> Any:
         public = self._secret is None

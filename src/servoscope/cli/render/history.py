@@ -46,8 +46,8 @@ def asset_table(statuses: Mapping[str, Mapping[str, Any]], width: int) -> Table:
     followed = {name: row for name, row in statuses.items() if not row["status"].get("service")}
     frequencies = sorted({f for row in followed.values() for f, *_ in row["status"].get("residual", ())})
     wide = width >= MIN_COLUMNS_OF_WIDE_TABLE + 9 * len(frequencies)
-    tests, more = (("T²/limit", "test"), ("NE 107", "last sample", "stored")) if wide else ((), ())
-    head = ("asset", "verdict", "since", *tests, *(f"γ {f:g} Hz" for f in frequencies), "alarms", *more)
+    tests, extra = (("T²/limit", "test"), ("NE 107", "last sample", "stored")) if wide else ((), ())
+    head = ("asset", "verdict", "since", *tests, *(f"γ {f:g} Hz" for f in frequencies), "alarms", *extra)
     rows, now = [], time.time()
     for name, row in followed.items():
         status = row["status"]
@@ -98,8 +98,8 @@ def service_lines(statuses: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 def fault_lines(statuses: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return a line for each asset with a fault."""
-    each = {name: row["status"] for name, row in statuses.items()}
-    return [f"{name}: {status['summary']}" for name, status in each.items() if status.get("verdict") == "fault"]
+    latest = {name: row["status"] for name, row in statuses.items()}
+    return [f"{name}: {status['summary']}" for name, status in latest.items() if status.get("verdict") == "fault"]
 
 
 def stale_store_lines(statuses: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -132,10 +132,10 @@ def format_relative_residual(residual: Sequence[float | None] | None) -> str:
 def active_alarms(statuses: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return the alarms that are not normal, one each."""
     return [
-        {"asset": name, "alarm": alarm, **one}
+        {"asset": name, "alarm": alarm, **state}
         for name, row in statuses.items()
-        for alarm, one in row["status"]["alarms"].items()
-        if one["state"] != "normal"
+        for alarm, state in row["status"]["alarms"].items()
+        if state["state"] != "normal"
     ]
 
 
@@ -166,7 +166,9 @@ def _format_cell(name: str, value: Any) -> str:
     if name == "outcome":
         return str(value) if len(value) <= OUTCOME else f"{value[: OUTCOME - 3]}..."
     if isinstance(value, Mapping):
-        return ", ".join(f"{plain_name(key)}: {_format_cell(key, one)}" for key, one in value.items() if one != "")
+        return ", ".join(
+            f"{plain_name(key)}: {_format_cell(key, nested)}" for key, nested in value.items() if nested != ""
+        )
     if name in ("state", "after", "what", "verdict", "priority", "grounds"):
         return translate(plain_name(str(value)))
     return _format_number(value) if isinstance(value, float) else str(value)

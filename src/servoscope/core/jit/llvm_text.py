@@ -183,25 +183,25 @@ class LlvmPrinter:
         """Write a vector of values."""
         if len(texts) == 1:
             return texts[0]
-        kind, found = vector(element, len(texts)), "poison"
+        kind, gathered = vector(element, len(texts)), "poison"
         for lane, text in enumerate(texts):
-            found = self.assign(f"insertelement {kind} {found}, {element} {text}, i64 {lane}")
-        return found
+            gathered = self.assign(f"insertelement {kind} {gathered}, {element} {text}, i64 {lane}")
+        return gathered
 
     def transpose(self, kind: str, rows: Sequence[str]) -> list[str]:
         """Write the columns of a square matrix that is given by its rows, all as vectors (Eklundh, 1972)."""
-        width, found, apart = len(rows), list(rows), 1
+        width, lanes, apart = len(rows), list(rows), 1
         while apart < width:
             first = [j + (width - apart if j & apart else 0) for j in range(width)]
             masks = [", ".join(f"i32 {j + shift}" for j in first) for shift in (0, apart)]
             for i in range(width):
                 if not i & apart:
-                    pair = f"{kind} {found[i]}, {kind} {found[i + apart]}"
-                    found[i], found[i + apart] = (
+                    pair = f"{kind} {lanes[i]}, {kind} {lanes[i + apart]}"
+                    lanes[i], lanes[i + apart] = (
                         self.assign(f"shufflevector {pair}, <{width} x i32> <{mask}>") for mask in masks
                     )
             apart *= 2
-        return found
+        return lanes
 
     # memory
 

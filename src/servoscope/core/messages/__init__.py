@@ -81,7 +81,7 @@ def set_language(name: str) -> None:
 
 
 # Of what is rendered without another one being named; de_DE is German too, and what nobody translated English.
-LANGUAGE = next((each for each in languages() if each == os.environ.get(SETTING, "")[:2].lower()), "en")
+LANGUAGE = next((candidate for candidate in languages() if candidate == os.environ.get(SETTING, "")[:2].lower()), "en")
 
 
 _spoken: ContextVar[str | None] = ContextVar("spoken", default=None)
@@ -104,10 +104,10 @@ def speak(name: str, zone: str | None = None) -> Iterator[None]:
 
     `zone`: the reader's time zone, as ``Europe/Berlin``; one that this machine does not know is not used.
     """
-    found = None
+    region = None
     with contextlib.suppress(ValueError, OSError):
-        found = ZoneInfo(zone) if zone else None
-    before, clock = _spoken.set(name), _zone.set(found)
+        region = ZoneInfo(zone) if zone else None
+    before, clock = _spoken.set(name), _zone.set(region)
     try:
         yield
     finally:
@@ -171,7 +171,7 @@ def _read_value(value: Any) -> Any:
     if isinstance(value, Mapping) and "key" in value:
         return Message(key=value["key"], values=value.get("values", {}))
     if isinstance(value, (list, tuple)):
-        return tuple(_read_value(each) for each in value)
+        return tuple(_read_value(item) for item in value)
     return value
 
 
@@ -207,14 +207,14 @@ def read_messages(written: Any, **texts: str) -> Any:
 
 def _restore(given: Any, text: Any) -> Any:
     if isinstance(text, (list, tuple)):
-        each = given if isinstance(given, (list, tuple)) and len(given) == len(text) else [None] * len(text)
-        return tuple(_restore(one, words) for one, words in zip(each, text, strict=True))
+        parts = given if isinstance(given, (list, tuple)) and len(given) == len(text) else [None] * len(text)
+        return tuple(_restore(part, words) for part, words in zip(parts, text, strict=True))
     try:
-        found = Message.model_validate(given)
-        render(found)
+        restored = Message.model_validate(given)
+        render(restored)
     except (ValueError, LookupError, TypeError, AttributeError):
         return text
-    return found
+    return restored
 
 
 def _format_utc(value: float) -> str:
@@ -255,7 +255,7 @@ class _Renderer(string.Formatter):
     def convert_field(self, value: Any, conversion: str | None) -> Any:
         if conversion == "w":
             several = isinstance(value, (list, tuple))
-            return [self._word(each) for each in value] if several else self._word(value)
+            return [self._word(item) for item in value] if several else self._word(value)
         return None if value is None else super().convert_field(value, conversion)
 
     def _word(self, value: Any) -> Any:
@@ -269,7 +269,7 @@ class _Renderer(string.Formatter):
         if isinstance(value, Message):
             value = render(value, self._language)
         if isinstance(value, (list, tuple)):
-            return self._join([self.format_field(each, "") for each in value], spec or "list")
+            return self._join([self.format_field(item, "") for item in value], spec or "list")
         if spec.startswith("#"):
             return count_words(value, spec[1:], self._language)
         if spec in FORMATS:
@@ -300,14 +300,14 @@ def render(given: Message, language: str | None = None) -> str:
 
 def count_words(count: float | str, noun: str, language: str | None = None) -> str:
     """Return a number of things, 1 row or 2 rows; `noun` is a name of the section ``count`` of the catalogue."""
-    one, _, several = render(message(f"count.{noun}", count=count), language).partition("|")
-    return one if str(count) == "1" else several
+    singular, _, several = render(message(f"count.{noun}", count=count), language).partition("|")
+    return singular if str(count) == "1" else several
 
 
 def template(key: str, language: str) -> str:
     """Return the template of a key; in English where the language has none."""
-    found = catalogue(language).get(key)
-    return found if found is not None else catalogue("en")[key]
+    text = catalogue(language).get(key)
+    return text if text is not None else catalogue("en")[key]
 
 
 def translate(words: str, language: str | None = None) -> str:
@@ -323,7 +323,13 @@ def translate(words: str, language: str | None = None) -> str:
         if f"word.{spelling}" in known:
             return known[f"word.{spelling}"]
     if " + " in words:  # a pair of faults
-        return " + ".join(translate(each, language) for each in words.split(" + "))
+        return " + ".join(translate(word, language) for word in words.split(" + "))
+    kind, of, joint = words.partition(" of ")
+    if of and f"word.{kind}" in known:  # of a joint of an arm
+        return render(message("quantity.of_joint", kind=kind, joint=joint), language)
+    joint, dot, parameter = words.partition(".")
+    if dot and f"word.{parameter}" in known:
+        return f"{joint}: {known[f'word.{parameter}']}"
     what, bracket, unit = words.partition(" [")
     return known.get(f"word.{what}", what) + bracket + unit
 

@@ -41,9 +41,9 @@ def rotate_row(F: Matrix, row: Numbers, first: int = 0) -> Matrix:
         turns = length > 0.0
         divisor = where(turns, length, 1.0)
         c, s = where(turns, F[i][0] / divisor, 1.0), where(turns, row[i] / divisor, 0.0)
-        rest = row[i:]
-        new.append([c * old + s * x for old, x in zip(F[i], rest, strict=True)])
-        row[i:] = [c * x - s * old for old, x in zip(F[i], rest, strict=True)]
+        tail = row[i:]
+        new.append([c * old + s * x for old, x in zip(F[i], tail, strict=True)])
+        row[i:] = [c * x - s * old for old, x in zip(F[i], tail, strict=True)]
     return new
 
 
@@ -57,8 +57,8 @@ def prior_factor(theta: Numbers, P: Matrix, R: Any) -> Matrix:
     for i in range(n):
         L.append([])
         for j in range(i + 1):
-            rest = sum_products([-x for x in L[i]], L[j][:j], P[i][j])
-            L[i].append(sqrt(rest) if i == j else rest / L[j][j])
+            remainder = sum_products([-x for x in L[i]], L[j][:j], P[i][j])
+            L[i].append(sqrt(remainder) if i == j else remainder / L[j][j])
         above = [[inverse[k][j] for k in range(i)] for j in range(n)]
         inverse.append(
             [sum_products([-x for x in L[i][:i]], above[j], zero + float(i == j)) / L[i][i] for j in range(n)]

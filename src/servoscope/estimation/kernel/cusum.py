@@ -50,7 +50,7 @@ class CusumConstants(NamedTuple):
 def whitening_filter(noise: ArmaNoise) -> tuple[FloatArray, FloatArray, float, int]:
     """Return numerator, denominator, gain and warm-up of the filter that whitens a noise."""
     length = max(len(noise.a), len(noise.b)) + 1
-    numerator, denominator = (np.pad(each, (0, length - len(each))) for each in noise.polynomials)
+    numerator, denominator = (np.pad(polynomial, (0, length - len(polynomial))) for polynomial in noise.polynomials)
     slowest = float(np.abs(np.roots(denominator)).max(initial=0.0)) if len(noise.b) else 0.0
     warm = MAX_WARMUP
     if slowest < 1.0:
@@ -105,9 +105,11 @@ def accumulate_sums(s: Any, at: int, psi: Sequence[Any], e: Any) -> None:
 
     Over several updates the logarithm is the sum of m e - m^2/2 with m = weights' psi, linear in psi e and psi psi'.
     """
-    factors = [(one, e) for one in psi] + [(one, other) for i, one in enumerate(psi) for other in psi[: i + 1]]
-    for k, (one, other) in enumerate(factors):
-        s[at + k] = fma(one, other, s[at + k])
+    factors = [(regressor, e) for regressor in psi] + [
+        (regressor, other) for i, regressor in enumerate(psi) for other in psi[: i + 1]
+    ]
+    for k, (factor, other) in enumerate(factors):
+        s[at + k] = fma(factor, other, s[at + k])
 
 
 def update_cusum(weights: Sequence[Any], psi: Sequence[Any], e: Any, g: Any, half: Any) -> Any:
@@ -121,6 +123,6 @@ def update_cusum(weights: Sequence[Any], psi: Sequence[Any], e: Any, g: Any, hal
 
 def update_cusum_by_sums(weights: Sequence[Any], sums: Sequence[Any], g: Any) -> Any:
     """Return a CUSUM g, in units of its limit, after the updates that the sums were taken over."""
-    for weight, one in zip(weights, sums, strict=True):
-        g = fma(weight, one, g)
+    for weight, addend in zip(weights, sums, strict=True):
+        g = fma(weight, addend, g)
     return minimum(maximum(g, 0.0), CAP)

@@ -35,12 +35,12 @@ class EvaluationSteps:
         white: list[Any] = []
         for j in range(n):
             column = [Cov[i][j] for i in range(j, n)]
-            rest = d[j]
+            remainder = d[j]
             if j:
                 column = [x - dot(G[j + i], G[j]) for i, x in enumerate(column)]
-                rest = rest - dot(G[j], white)
+                remainder = remainder - dot(G[j], white)
             inverse = 1.0 / sqrt(maximum(column[0], MIN_VARIANCE))
-            white.append(rest * inverse)
+            white.append(remainder * inverse)
             for i, x in enumerate(column):
                 G[j + i].append(x * inverse)
         q[0] = h[UPDATES]

@@ -77,8 +77,8 @@ class SampleSteps:
 
     def advance_shadow(self, c: Any, s: Any, w: Any, tile: Any, i: Any) -> None:
         """Pass an undisturbed r through the healthy loop: columns and residual of the test go to w."""
-        found = sparse_lti.advance_system(self._shadow, c, self.at.shadow, s, self.to.shadow, [tile[i]])
-        for k, number in zip([self.columns, *range(self.columns)], found, strict=False):
+        outputs = sparse_lti.advance_system(self._shadow, c, self.at.shadow, s, self.to.shadow, [tile[i]])
+        for k, number in zip([self.columns, *range(self.columns)], outputs, strict=False):
             w[i * (self.columns + 1) + k] = number
 
     def update_undisturbed(self, c: Any, s: Any, h: Any, w: Any, when: Any, tile: Any, i: Any) -> None:
@@ -242,19 +242,19 @@ class SampleSteps:
 
     def update_cusums(self, c: Any, g: Any, w: Any, top: Any, i: Any) -> None:
         """Update the CUSUMs g with the whitened residual of sample i; c begins with their weights."""
-        columns, each = self.columns, self.size.watched // CUSUM_BATCH if self.single_lane else CUSUM_BATCH
-        count = each if self.single_lane else self.size.watched
+        columns, batch = self.columns, self.size.watched // CUSUM_BATCH if self.single_lane else CUSUM_BATCH
+        count = batch if self.single_lane else self.size.watched
         psi, white, best = [w[i * (columns + 1) + k] for k in range(columns)], w[i * (columns + 1) + columns], top[i]
-        for j in range(each):
+        for j in range(batch):
             g[j] = update_cusum([c[j + count * k] for k in range(columns)], psi, white, g[j], c[j + count * columns])
             best = maximum(best, g[j])
         top[i] = best
 
     def update_cusums_by_sums(self, c: Any, g: Any, sums: Any, top: Any, i: Any) -> None:
         """Update the CUSUMs g with the sums of an evaluation; c begins with their weights, `top` is row i."""
-        each = self.size.watched // CUSUM_BATCH if self.single_lane else CUSUM_BATCH
-        count, best = each if self.single_lane else self.size.watched, top[i]
-        for j in range(each):
+        batch = self.size.watched // CUSUM_BATCH if self.single_lane else CUSUM_BATCH
+        count, best = batch if self.single_lane else self.size.watched, top[i]
+        for j in range(batch):
             weights = [c[j + count * k] for k in range(self.sums)]
             g[j] = update_cusum_by_sums(weights, [sums[k] for k in range(self.sums)], g[j])
             best = maximum(best, g[j])

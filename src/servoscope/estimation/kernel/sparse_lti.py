@@ -28,11 +28,11 @@ def sparsity_pattern(systems: Sequence[LinearSystem]) -> SparsityPattern:
 
 def pad_system(system: LinearSystem, states: int, rows: int) -> LinearSystem:
     """Return a system with as many states and outputs, those that are added zero."""
-    more, silent = (0, states - len(system.A)), (0, rows - len(system.C))
+    padding, silent = (0, states - len(system.A)), (0, rows - len(system.C))
     return LinearSystem(
-        np.pad(system.A, (more, more)),
-        np.pad(system.B, (more, (0, 0))),
-        np.pad(system.C, (silent, more)),
+        np.pad(system.A, (padding, padding)),
+        np.pad(system.B, (padding, (0, 0))),
+        np.pad(system.C, (silent, padding)),
         np.pad(system.D, (silent, (0, 0))),
     )
 

@@ -83,10 +83,10 @@ static void process(@{prefix}_state *state, @{number} r, @{number} u, @{number} 
 @{after}
 }
 
-/* Count how long statistics have been above their limits; return the verdict. */
+@{covariates}/* Count how long statistics have been above their limits; return the verdict. */
 static @{prefix}_verdict judge(@{prefix}_state *state, const @{prefix}_evaluation *q)
 {
-    const int ready = q->updates > @{zero};
+    const int ready = @{ready};
     const int exceeded = ready && ((q->statistic > LIMIT) || (q->level >= @{one}));
     @{prefix}_verdict verdict = @{upper}_WAITING;
 
@@ -109,8 +109,8 @@ static int sample(@{prefix}_state *state, @{number} r, @{number} u, @{number} y,
 {
     int due;
     int f;
-
-    process(state, r, u, y, restart);
+@{covariate_locals}
+    process(state, @{taken}, u, y, restart);
     due = ((uint64_t)state->counters[SAMPLE] % @{upper}_EVERY) == 0u;
     if (due != 0) {
         evaluate(state->numbers, state->counters, q);
@@ -118,7 +118,7 @@ static int sample(@{prefix}_state *state, @{number} r, @{number} u, @{number} y,
             q->gamma[f].real = q->response[f].real - healthy[f].real;
             q->gamma[f].imag = q->response[f].imag - healthy[f].imag;
         }
-        q->verdict = judge(state, q);
+@{covariate_compare}        q->verdict = judge(state, q);
     }
     return due;
 }

@@ -5,7 +5,7 @@
  * This file and @{prefix}.c are yours: use, change and pass them on as you like; no licence of servoscope applies.
  *
  * No memory is allocated, nothing is recursive, every loop is bounded, and all state is in one struct. Of the C library
- * fma, fabs, sqrt and memcpy are called. A double has to be an IEEE 754 binary64; rounding is to nearest, subnormal
+ * fma, fabs, sqrt@{and_exp} and memcpy are called. A double has to be an IEEE 754 binary64; rounding is to nearest, subnormal
  * numbers are kept (no flush to zero), and no option such as -ffast-math may be given.
  */
 #ifndef @{guard}
@@ -89,7 +89,7 @@ typedef struct {
     @{number} imag;
 } @{prefix}_residual;
 
-/* One evaluation. */
+@{covariates_interface}/* One evaluation. */
 typedef struct {
     @{number} updates;   /* samples that the estimate has taken so far */
     @{number} statistic; /* T^2; its limit is @{prefix}_limit */
@@ -100,7 +100,7 @@ typedef struct {
     @{prefix}_response response[@{upper}_FREQUENCIES];
     @{prefix}_residual gamma[@{upper}_FREQUENCIES];
     @{prefix}_verdict verdict;
-} @{prefix}_evaluation;
+@{covariate_field}} @{prefix}_evaluation;
 
 /* The monitored frequencies, [Hz], and the limit of T^2. */
 extern const double @{prefix}_frequencies[@{upper}_FREQUENCIES];
@@ -109,7 +109,7 @@ extern const @{number} @{prefix}_limit;
 /* Make the state before the first sample. */
 void @{prefix}_init(@{prefix}_state *state);
 
-/* Say that the next sample does not follow the one before by one sample time. */
+@{covariate_function}/* Say that the next sample does not follow the one before by one sample time. */
 void @{prefix}_restart(@{prefix}_state *state);
 
 /*

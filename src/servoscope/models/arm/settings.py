@@ -18,7 +18,6 @@ from servoscope.models.arm.dynamics import STANDARD_GRAVITY
 from servoscope.models.arm.urdf import Kinematics, parse_urdf
 from servoscope.models.loop import Loop
 
-SIGNALS = ("position", "torque", "temperature")  # of a joint, each with a key of its table
 DEFAULT_CUTOFF = 5.0  # Hz; the motion of an arm lies below, the ripple of its gears above
 
 
@@ -128,8 +127,8 @@ class ArmLoop(Settings):
     @property
     def channels(self) -> dict[str, str]:
         """The columns of all signals, by ``JOINT.position``, ``JOINT.torque`` and so on, and ``tool``."""
-        joints = ((f"{name}.{key}", getattr(joint, key)) for name, joint in self.joints.items() for key in SIGNALS)
-        return {name: column for name, column in (*joints, ("tool", self.tool)) if column is not None}
+        tables = ((f"{name}.{key}", value) for name, joint in self.joints.items() for key, value in joint)
+        return {name: column for name, column in (*tables, ("tool", self.tool)) if isinstance(column, str)}
 
     @property
     def carrier(self) -> Loop:
@@ -143,7 +142,7 @@ class ArmLoop(Settings):
     def of_channels(self) -> Self:
         """Return it for columns that are called as `channels` says, and time in seconds in a column ``t``."""
         joints = {
-            name: joint.model_copy(update={key: f"{name}.{key}" for key in SIGNALS if getattr(joint, key) is not None})
+            name: joint.model_copy(update={key: f"{name}.{key}" for key, value in joint if isinstance(value, str)})
             for name, joint in self.joints.items()
         }
         tool = None if self.tool is None else "tool"

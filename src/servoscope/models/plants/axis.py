@@ -243,7 +243,7 @@ class AxisPlant(TermPlant):
         own = self._nominal()["inertia"] / self.payload_arm**2 if self.payload_mass is None else self.payload_mass
         return (ratio - 1.0) * own
 
-    def exponents(self, parameter: str) -> Mapping[str, float]:
+    def exponents(self, parameter: str, healthy: Mapping[str, float] | None = None) -> Mapping[str, float]:
         """Return the powers by coefficient; friction that differs by direction changes in both."""
         if parameter == "viscous_friction" and "viscous_by_direction" in self.terms:
             return dict.fromkeys(BY_DIRECTION, 1.0)

@@ -103,6 +103,10 @@ class Plant(BaseModel, abc.ABC):
     parameters_are_coefficients: ClassVar[bool] = False
     # by parameter, the angle by which coefficients leave its curve, in their standard deviations [rad]
     ray_angles: ClassVar[Mapping[str, float]] = {}
+    # by parameter, the standard deviation of the logarithm of its ratio as a share of that, where it is known roughly
+    size_errors: ClassVar[Mapping[str, float]] = {}
+    # whether names come from coefficients fitted to all samples since the onset, by how such fits scatter when healthy
+    fits_stretches: ClassVar[bool] = False
 
     kind: str  # name of the plant in a loop file
     # factor on u as recorded, before anything else is done with it, for example a torque constant
@@ -120,6 +124,11 @@ class Plant(BaseModel, abc.ABC):
     @abc.abstractmethod
     def powers(self) -> tuple[int, ...]:
         """Powers of s of the linear columns; the first ``len(powers)`` coefficients belong to them."""
+
+    @property
+    def channels(self) -> Mapping[str, str]:
+        """Columns of a log that it takes besides r, u and y, by the name that they have in a recording."""
+        return {}
 
     @property
     def derivative(self) -> int:
@@ -226,8 +235,8 @@ class Plant(BaseModel, abc.ABC):
         """
         return {}
 
-    def exponents(self, parameter: str) -> Mapping[str, float]:
-        """Return, by coefficient, the power of a parameter's ratio with which it goes.
+    def exponents(self, parameter: str, healthy: Mapping[str, float] | None = None) -> Mapping[str, float]:
+        """Return, by coefficient, the power of a parameter's ratio with which it goes, about `healthy` coefficients.
 
         So it is where the coefficients are all that is known of a plant.
         """

@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from servoscope.core.errors import LoopError
+from servoscope.core.settings import NonEmptyStr, Settings
 from servoscope.models.plants.base import Fault, StateSpace, read_translations
 from servoscope.models.plants.columns import Column
 from servoscope.models.plants.terms import TERM_TUPLE, UNIQUE_TERMS, TermColumn, TermPlant
@@ -16,6 +17,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 TermName = Literal["jerk", "spring", "process", "droop", "overlap", "leakage", "offset"]
 
+CHANNELS = "p_A", "p_B", "p_S"  # of logged pressures, in a recording
 BY_DIRECTION = "velocity_forward", "velocity_backward"
 ACCELERATION = TermColumn("acceleration", 2, 1, signed=True)
 # term -> its column; the velocity by direction, for two areas, and the acceleration are part of every cylinder
@@ -33,15 +35,18 @@ TERMS: dict[str, TermColumn] = {
 }
 """What moves u besides the velocity, by the name that a loop file declares, in the order of the coefficients."""
 
+LOAD_SHARE = 0.15  # of the supply pressure that load, friction and lines take, as the middle of 0 to 0.3
 SUPPLY = {
-    **dict.fromkeys((*BY_DIRECTION, "acceleration", "jerk", "leakage"), -0.5),
-    **dict.fromkeys(("spring", "process", "droop"), -1.5),
+    **dict.fromkeys(("acceleration", "jerk", "leakage"), -0.5),
+    **dict.fromkeys(BY_DIRECTION, -0.5 / (1.0 - LOAD_SHARE)),
+    **dict.fromkeys(("spring", "process", "droop"), -1.0 - 0.5 / (1.0 - LOAD_SHARE)),
 }
 EXPONENTS: dict[str, dict[str, float]] = {
     "supply_pressure": SUPPLY,
-    "gain_forward": {"velocity_forward": -1.0, "spring": -0.5, "process": -0.5},
-    "gain_backward": {"velocity_backward": -1.0, "spring": -0.5, "process": -0.5},
-    "load": dict.fromkeys(BY_DIRECTION, 1.0),
+    "gain_forward": {"velocity_forward": -1.0, "acceleration": -0.5, "spring": -0.5, "process": -0.5},
+    "gain_backward": {"velocity_backward": -1.0, "acceleration": -0.5, "spring": -0.5, "process": -0.5},
+    # a force takes its part of the pressure, as a lower supply does, by the area on which it acts
+    "load": {**dict.fromkeys(BY_DIRECTION, 1.0), **dict.fromkeys(("spring", "process", "droop"), 3.0)},
 }
 """Parameters that move several coefficients; the flow through an edge is g x sqrt(p_S - p_load) (Merritt, 1967)."""
 
@@ -70,17 +75,17 @@ FAULTS: dict[str, tuple[str, tuple[float, float], str, str]] = {
     ),
     "overlap": (
         "overlap",
-        (0.1, 20.0),
+        (0.1, 10.0),
         "more u before anything moves: overlap of the valve, hysteresis, static friction",
         "valve: worn edges, its zero, contamination; amplifier: dead band",
     ),
     "acceleration": (
         "lag",
-        (0.05, 20.0),
+        (1.0, 20.0),
         "u comes late: a slow spool, a heavier load",
         "valve: pilot pressure, contamination, amplifier; mass that is moved",
     ),
-    "jerk": ("air", (0.05, 20.0), "softer oil: air", "oil: air in it, foam, water, age; oil level and suction line"),
+    "jerk": ("air", (1.0, 20.0), "softer oil: air", "oil: air in it, foam, water, age; oil level and suction line"),
     "offset": (
         "zero",
         (0.1, 10.0),
@@ -96,6 +101,14 @@ FAULTS: dict[str, tuple[str, tuple[float, float], str, str]] = {
 }
 
 
+class Pressures(Settings):
+    """Columns of logged pressures, all three in one unit."""
+
+    A: NonEmptyStr
+    B: NonEmptyStr
+    supply: NonEmptyStr
+
+
 class CylinderPlant(TermPlant):
     """Cylinder ``input_gain u = c_forward max(y', 0) + c_backward min(y', 0) + acceleration y'' + sum of terms``.
 
@@ -106,8 +119,14 @@ class CylinderPlant(TermPlant):
     """
 
     EXPONENTS: ClassVar[Mapping[str, Mapping[str, float]]] = EXPONENTS
-    # the root of the load pressure is of first order here: three times the process force also moves the overlap
-    ray_angles: ClassVar[Mapping[str, float]] = {"process": 0.15}
+    # the root of the load pressure is of first order here, so that large changes move other terms too
+    ray_angles: ClassVar[Mapping[str, float]] = {
+        **dict.fromkeys(FAULTS, 0.1),
+        **dict.fromkeys(("supply_pressure", "load", "offset"), 0.05),
+        **dict.fromkeys(("overlap", "process"), 0.2),
+    }
+    size_errors: ClassVar[Mapping[str, float]] = {"supply_pressure": 0.1}  # as `LOAD_SHARE` may be 0 to 0.3
+    fits_stretches: ClassVar[bool] = True
     translations: ClassVar[Mapping[str, Mapping[str, str]]] = read_translations(__file__)
 
     kind: Literal["cylinder"] = "cylinder"
@@ -118,6 +137,8 @@ class CylinderPlant(TermPlant):
     )
     # output beyond which the force of the term ``process`` acts
     contact: Finite | None = None
+    # columns of the pressures at both sides of the piston, and of the supply: A is the side that u > 0 fills
+    pressures: Annotated[Pressures, Field(exclude_if=lambda value: value is None)] | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -132,6 +153,11 @@ class CylinderPlant(TermPlant):
     def has_physics(self) -> bool:
         """The columns say what u a motion asks for, and nothing of the motion that u makes."""
         return False
+
+    @property
+    def channels(self) -> Mapping[str, str]:
+        """The pressures."""
+        return {} if self.pressures is None else dict(zip(CHANNELS, vars(self.pressures).values(), strict=True))
 
     @property
     def columns(self) -> tuple[TermColumn, ...]:
@@ -174,8 +200,19 @@ class CylinderPlant(TermPlant):
         return tuple(
             Fault(name, parameter, range_, words, checks)
             for parameter, (name, range_, words, checks) in FAULTS.items()
-            if parameter in EXPONENTS or parameter in self.names
+            if parameter in EXPONENTS or parameter in self.names or self.pressures is not None
         )
+
+    def exponents(self, parameter: str, healthy: Mapping[str, float] | None = None) -> Mapping[str, float]:
+        """Return the powers by coefficient; a force weighs more where it acts on the smaller area.
+
+        At the same u the speeds of both directions are as the roots of the areas (Jelali and Kroll, 2003).
+        """
+        powers = super().exponents(parameter, healthy)
+        if parameter != "load" or healthy is None:
+            return powers
+        forward, backward = (healthy[name] for name in BY_DIRECTION)
+        return {**powers, "velocity_backward": (backward / forward) ** 2}
 
     def state_spaces(self, factors: Mapping[str, Any], count: int) -> StateSpace:
         """Raise LoopError: see `has_physics`."""

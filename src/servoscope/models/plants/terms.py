@@ -98,7 +98,7 @@ class TermPlant(Plant):
         """Columns of the other terms."""
         return tuple(column.column for column in self.columns if isinstance(column.column, Column))
 
-    def exponents(self, parameter: str) -> Mapping[str, float]:
+    def exponents(self, parameter: str, healthy: Mapping[str, float] | None = None) -> Mapping[str, float]:
         """Return, by coefficient, the power of the parameter's ratio with which it goes."""
         if parameter == "input_gain":
             return dict.fromkeys(self.names, 1.0)

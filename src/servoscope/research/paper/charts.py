@@ -88,14 +88,14 @@ def draw_windup(seed: int) -> Figure:
 @plot_style()
 def draw_poles() -> Figure:
     """Draw the magnitudes of all closed-loop poles with the healthy plant and with all of Table 2."""
-    found = pole_magnitudes()
+    magnitudes_by_plant = pole_magnitudes()
     figure = Figure(figsize=(WIDTH * 0.7, 3.6), layout="constrained")
     ax = figure.subplots()
-    places = np.arange(len(found))[::-1]
-    for place, magnitudes in zip(places, found.values(), strict=True):
+    places = np.arange(len(magnitudes_by_plant))[::-1]
+    for place, magnitudes in zip(places, magnitudes_by_plant.values(), strict=True):
         ax.plot(magnitudes, np.full(len(magnitudes), place), "o", color=COLOURS["measured"], markersize=4.0, alpha=0.7)
     ax.axvline(1.0, color=COLOURS["alarm"], linewidth=1.0)
-    ax.set_yticks(places, list(found))
+    ax.set_yticks(places, list(magnitudes_by_plant))
     ax.set(xlabel="magnitude of the closed-loop poles; stable below 1", xlim=(-0.02, 1.05))
     return figure
 

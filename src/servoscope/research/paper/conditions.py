@@ -96,9 +96,9 @@ class OperatingConditions:
 
     def __str__(self) -> str:
         """Return ``profile``, and what differs from the paper."""
-        more = [f"amplitude x{self.amplitude:g}"] if self.amplitude != 1.0 else []
-        more += [f"noise x{self.noise:g}"] if self.noise != 1.0 else []
-        return ", ".join([self.reference, *more])
+        details = [f"amplitude x{self.amplitude:g}"] if self.amplitude != 1.0 else []
+        details += [f"noise x{self.noise:g}"] if self.noise != 1.0 else []
+        return ", ".join([self.reference, *details])
 
     def reference_signal(self) -> FloatArray:
         """Return the reference [m], shape (6000,)."""

@@ -133,17 +133,17 @@ def figure_6(seed: int, version: str) -> Figure:
 
 
 @plot_style()
-def figure_7(found: Table2Residuals) -> Figure:
+def figure_7(metrics: Table2Residuals) -> Figure:
     """Draw the residuals of Table 2 over the last 10 s: one row per frequency, one marker per size."""
     figure = Figure(figsize=(WIDTH, 8.4), layout="constrained")
     axes = figure.subplots(3, 2, width_ratios=[1, 1])
     pairs = (("pump", "leakage"), ("friction", "contamination"))
     for row, (i, f) in zip(axes, enumerate(FREQUENCIES), strict=True):
-        healthy = found.healthy.between(50.0, 60.0).gamma[:, i]
+        healthy = metrics.healthy.between(50.0, 60.0).gamma[:, i]
         for ax, pair in zip(row, pairs, strict=True):
             _draw_zero_lines(ax)
             ax.plot(healthy.real, healthy.imag, ".", color=INK, markersize=2.0, zorder=3)
-            for course, case in zip(found.cases, TABLE_2, strict=True):
+            for course, case in zip(metrics.cases, TABLE_2, strict=True):
                 if case.fault in pair:
                     z = course.between(50.0, 60.0).gamma[::4, i]
                     marker = MARKERS[SIZES[case.parameter].index(case.ratio)]

@@ -58,24 +58,24 @@ def noise_free_metrics() -> dict[str, float]:
     """Return what needs no noise: sensitivities, stability, causes of the bias."""
     plant = rig_plant()
     h, g = sensitivity.sensitivity_of_H(plant, FREQUENCIES), sensitivity.sensitivity_of_G(plant, FREQUENCIES)
-    found = {"stability.largest": max(float(poles[-1]) for poles in table.pole_magnitudes().values())}
+    metrics = {"stability.largest": max(float(poles[-1]) for poles in table.pole_magnitudes().values())}
     differences = []
     for i, j in itertools.combinations(range(len(plant.parameters)), 2):
         angles, same = sensitivity.angle_between(h[i], h[j]), sensitivity.angle_between(g[i], g[j])
         differences.append(float(np.abs(angles - same).max()))
         for f, value in zip(FREQUENCIES, angles, strict=True):
-            found[f"sensitivity.{plant.parameters[i]}-{plant.parameters[j]}.{f:g}"] = float(value)
-    found["sensitivity.angle_difference"] = round(max(differences), 9)
+            metrics[f"sensitivity.{plant.parameters[i]}-{plant.parameters[j]}.{f:g}"] = float(value)
+    metrics["sensitivity.angle_difference"] = round(max(differences), 9)
     for name, values in (("H", h), ("G", g)):
         size = np.linalg.norm(values, axis=0)
-        found[f"sensitivity.growth_{name}"] = float(size[-1] / size[0])
-    return found | tracking.bias_metrics()
+        metrics[f"sensitivity.growth_{name}"] = float(size[-1] / size[0])
+    return metrics | tracking.bias_metrics()
 
 
 def merge_metrics(results: Sequence[tuple[SeedJob, dict[str, float]]]) -> dict[str, list[float]]:
     """Return name -> one value per seed."""
     metrics: dict[str, list[float]] = {}
-    for _, found in sorted(results, key=lambda result: result[0].seed):
-        for name, value in found.items():
+    for _, outcome in sorted(results, key=lambda result: result[0].seed):
+        for name, value in outcome.items():
             metrics.setdefault(name, []).append(value)
     return metrics

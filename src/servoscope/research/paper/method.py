@@ -142,24 +142,24 @@ def nominal_signatures(loop: Loop) -> dict[str, tuple[FloatArray, ComplexArray]]
     single = loop.monitor.model_copy(update={"two_stage": "none"})
     E = Pipeline.of(loop.model_copy(update={"monitor": single})).bank.E(FREQUENCIES)
     healthy = nominal_theta(loop)
-    found = {}
+    signatures = {}
     for fault in loop.plant.faults:
         low, high = np.log(RATIO_RANGES[fault.parameter])
         sizes = np.exp(np.linspace(low, high, GRID))
         faulty = [loop.plant.with_ratios({fault.parameter: float(size)}) for size in sizes]
         theta = np.array([nominal_theta(loop, plant) for plant in faulty])
-        found[fault.name] = (sizes, (theta - healthy) @ E.T)
-    return found
+        signatures[fault.name] = (sizes, (theta - healthy) @ E.T)
+    return signatures
 
 
 def labelled_signatures(courses: Sequence[ResidualTrace]) -> dict[str, tuple[FloatArray, ComplexArray]]:
     """Return what labelled recordings of all cases of Table 2, in its order, show at their end: no physics needed."""
-    found: dict[str, tuple[list[float], list[ComplexArray]]] = {}
+    points: dict[str, tuple[list[float], list[ComplexArray]]] = {}
     for case, course in zip(TABLE_2, courses, strict=True):
-        sizes, curve = found.setdefault(case.fault, ([], []))
+        sizes, curve = points.setdefault(case.fault, ([], []))
         sizes.append(case.ratio)
         curve.append(course.between(50.0, np.inf).gamma.mean(axis=0))
-    return {name: (np.array(sizes), np.array(curve)) for name, (sizes, curve) in found.items()}
+    return {name: (np.array(sizes), np.array(curve)) for name, (sizes, curve) in points.items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,8 +46,8 @@ def run_reproduction(seeds: Sequence[int], told: StepCallback = lambda _: None) 
     """Measure everything, on all cores; `told` takes the name of each job that is done."""
     work = jobs.list_jobs(seeds)
     done: list[tuple[SeedJob, dict[str, float]]] = []
-    for job, found in run_jobs(work, min(core_count(), len(work))):
-        done.append((job, found))
+    for job, outcome in run_jobs(work, min(core_count(), len(work))):
+        done.append((job, outcome))
         told(f"seed {job.seed}, {job.part}")
     metrics = jobs.merge_metrics(done)
     return Reproduction(tuple(seeds), metrics, tuple(claims.evaluate_claims(metrics)))
@@ -59,10 +59,10 @@ def run_jobs(work: Sequence[SeedJob], processes: int) -> Iterator[tuple[SeedJob,
         yield from ((job, jobs.run_job(job)) for job in work)
         return
     pool = Workers(environment={**os.environ, **dict.fromkeys(ONE_THREAD, "1")})
-    for job, found in pool.map(f"{__name__}:run_in_worker", work, processes):
-        if isinstance(found, WorkerError):
-            raise found
-        yield job, found
+    for job, outcome in pool.map(f"{__name__}:run_in_worker", work, processes):
+        if isinstance(outcome, WorkerError):
+            raise outcome
+        yield job, outcome
 
 
 def run_in_worker(_: StepCallback, job: SeedJob) -> dict[str, float]:
@@ -70,12 +70,12 @@ def run_in_worker(_: StepCallback, job: SeedJob) -> dict[str, float]:
     return jobs.run_job(job)
 
 
-def list_figures(found: Reproduction) -> Iterator[tuple[str, Callable[[], Figure]]]:
+def list_figures(reproduction: Reproduction) -> Iterator[tuple[str, Callable[[], Figure]]]:
     """Yield the name of each figure and what draws it: for the paper's method, and for the default on the same data."""
     from servoscope.research.paper import charts, figures
     from servoscope.research.paper.table import table_2_residuals
 
-    seed, metrics = found.seeds[0], found.metrics
+    seed, metrics = reproduction.seeds[0], reproduction.metrics
     yield "figure-2", figures.figure_2
     yield "figure-4", lambda: figures.figure_4(seed)
     for version in figures.METHODS:
@@ -91,7 +91,7 @@ def list_figures(found: Reproduction) -> Iterator[tuple[str, Callable[[], Figure
     yield "fault-tolerance", lambda: charts.draw_tolerance(seed)
 
 
-def write_reproduction(found: Reproduction, folder: Path, told: StepCallback = lambda _: None) -> list[Path]:
+def write_reproduction(reproduction: Reproduction, folder: Path, told: StepCallback = lambda _: None) -> list[Path]:
     """Write all figures and the table of claims; return the files.
 
     Raises OutputError if the folder or a file cannot be written.
@@ -105,13 +105,13 @@ def write_reproduction(found: Reproduction, folder: Path, told: StepCallback = l
             written.append(folder / f"{name}{suffix}")
             atomic_write(written[-1], files(__package__).joinpath(written[-1].name).read_bytes())
         told(name)
-    for name, draw in list_figures(found):
+    for name, draw in list_figures(reproduction):
         figure = draw()
         for suffix in SUFFIXES:
             save_figure(figure, folder / f"{name}{suffix}")
             written.append(folder / f"{name}{suffix}")
         told(name)
-    content = json.dumps(found.to_dict(), indent=1, allow_nan=False) + "\n"
+    content = json.dumps(reproduction.to_dict(), indent=1, allow_nan=False) + "\n"
     atomic_write(folder / "claims.json", content.encode())
-    atomic_write(folder / "claims.md", claims.format_markdown(found.claims, len(found.seeds)).encode())
+    atomic_write(folder / "claims.md", claims.format_markdown(reproduction.claims, len(reproduction.seeds)).encode())
     return [*written, folder / "claims.json", folder / "claims.md"]

@@ -51,11 +51,11 @@ def table_2_residuals(method: str, seed: int, labels: int = 0) -> Table2Residual
 def residual_separations(residuals: Table2Residuals) -> dict[str, float]:
     """Return angle and smallest separation of two pairs of faults at each frequency."""
     result: dict[str, float] = {}
-    for one, other in PAIRS:
+    for fault, other in PAIRS:
         for i, f in enumerate(FREQUENCIES):
             origin = complex(residuals.healthy.between(50.0, 60.0).gamma[:, i].mean())
-            angle, apart = metrics.compare_clouds(residuals.clouds(i, one), residuals.clouds(i, other), origin)
-            result[f"angle.{one}-{other}.{f:g}"], result[f"apart.{one}-{other}.{f:g}"] = angle, apart
+            angle, apart = metrics.compare_clouds(residuals.clouds(i, fault), residuals.clouds(i, other), origin)
+            result[f"angle.{fault}-{other}.{f:g}"], result[f"apart.{fault}-{other}.{f:g}"] = angle, apart
     return result
 
 

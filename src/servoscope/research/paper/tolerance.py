@@ -133,16 +133,16 @@ def evaluate_rescheduling(case: FaultCase, seed: int) -> ReschedulingResult:
 
 def tolerance_metrics(seed: int) -> dict[str, float]:
     """Return tracking errors [m] before the fault, after it without action, and with it."""
-    found: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     for case in CASES:
         result = evaluate_rescheduling(case, seed)
         name = f"tolerance.{case.fault}"
-        found[f"{name}.before"] = result.rms_error(result.y_without_action, (20.0, 30.0))
-        found[f"{name}.idle"], found[f"{name}.acted"] = (
+        metrics[f"{name}.before"] = result.rms_error(result.y_without_action, (20.0, 30.0))
+        metrics[f"{name}.idle"], metrics[f"{name}.acted"] = (
             result.rms_error(result.y_without_action),
             result.rms_error(result.y_with_action),
         )
-        found[f"{name}.at"] = float("nan") if result.at_s is None else result.at_s - FAULT_AT
-        found[f"{name}.ratio"] = float("nan") if result.ratio is None else result.ratio
-        found[f"{name}.k_p"], found[f"{name}.k_i"] = result.controller
-    return found
+        metrics[f"{name}.at"] = float("nan") if result.at_s is None else result.at_s - FAULT_AT
+        metrics[f"{name}.ratio"] = float("nan") if result.ratio is None else result.ratio
+        metrics[f"{name}.k_p"], metrics[f"{name}.k_i"] = result.controller
+    return metrics

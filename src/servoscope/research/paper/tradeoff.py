@@ -65,12 +65,12 @@ def curve_column(flat: dict[str, float], conditions: OperatingConditions, estima
 
 
 def cv_ratio(
-    flat: dict[str, float], conditions: OperatingConditions, name: str, one: str = "akf", other: str = "dfrls"
+    flat: dict[str, float], conditions: OperatingConditions, name: str, first: str = "akf", other: str = "dfrls"
 ) -> float:
     """Return CV of one estimator over that of another at equal rise time; below 1 the first is the quieter."""
     pairs = [
-        (curve_column(flat, conditions, each, "rise"), curve_column(flat, conditions, each, name))
-        for each in (one, other)
+        (curve_column(flat, conditions, curve, "rise"), curve_column(flat, conditions, curve, name))
+        for curve in (first, other)
     ]
     return metrics.ratio_at_equal_rise(*pairs[0], *pairs[1])
 

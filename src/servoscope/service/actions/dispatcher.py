@@ -76,9 +76,11 @@ class OutboxDispatcher:
             except StoreError:
                 continue  # the service notices for itself
             due = {(row["key"], row["attempts"]): OutboxEntry(**row) for row in rows}
-            self._in_progress = {one: sink for one, sink in self._in_progress.items() if one in due or sink in busy}
-            new = {one: entry for one, entry in due.items() if one not in self._in_progress}
-            self._in_progress |= {one: entry.sink for one, entry in new.items()}
+            self._in_progress = {
+                identity: sink for identity, sink in self._in_progress.items() if identity in due or sink in busy
+            }
+            new = {identity: entry for identity, entry in due.items() if identity not in self._in_progress}
+            self._in_progress |= {identity: entry.sink for identity, entry in new.items()}
             for sink in {entry.sink for entry in new.values()}:
                 self._busy.add(sink)
                 job = sink, [entry for entry in new.values() if entry.sink == sink]

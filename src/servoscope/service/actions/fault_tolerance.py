@@ -61,7 +61,8 @@ def accommodate_fault(
     target = settings.nominal if ratio is None else settings.target_value(ratio)
     bounded = min(max(target, settings.min), settings.max)
     step = min(max(bounded - state.value, -settings.max_step), settings.max_step)
-    changed = tuple(one for one in state.changed if time - HOUR_S < one)  # the future counts too: the clock was set
+    # the future counts too: the clock was set
+    changed = tuple(moment for moment in state.changed if time - HOUR_S < moment)
     worthwhile = abs(step) > MIN_STEP_SHARE * settings.max_step  # False for NaN
     if settings.mode == "off" or not worthwhile or len(changed) >= settings.per_hour:
         return state, None, None

@@ -94,7 +94,7 @@ class CommandSettings(SinkSettings):
     def _check_placeholders(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         known = {f"{{{name}}}" for name in PLACEHOLDERS}
         for argument in set(value) - known:
-            if part := next((one for one in known if one in argument), None):
+            if part := next((placeholder for placeholder in known if placeholder in argument), None):
                 raise ValueError(f"{argument!r}: a placeholder is an argument of its own, write {part!r} alone")
             if re.fullmatch(r"\{\w+\}", argument):
                 raise ValueError(f"{argument!r} is no placeholder, choose from {', '.join(sorted(known))}")

@@ -90,7 +90,7 @@ def advance_flood(
     # Assets report transitions one after the other: what is a little ahead counts, a clock that was set does not.
     recent = state.recent
     if recent and max(time - min(recent), max(recent) - time) >= settings.period_s:
-        recent = tuple(one for one in recent if abs(time - one) < settings.period_s)
+        recent = tuple(alarm_time for alarm_time in recent if abs(time - alarm_time) < settings.period_s)
     if state.since is None:
         return replace(state, recent=recent, counted=0, peak=0), ()
     if len(recent) >= settings.ends_below:

@@ -84,7 +84,7 @@ def advance_alarms(
             update = replace(update, alarms=active)
         new[name], transitions = step_alarm(definition, new[name], update, time)
         advanced += transitions
-    return new, tuple(sorted(advanced, key=lambda one: one.time))
+    return new, tuple(sorted(advanced, key=lambda transition: transition.time))
 
 
 def next_event_time(definitions: Mapping[str, AlarmDefinition], states: Mapping[str, AlarmState]) -> float:
@@ -113,8 +113,8 @@ class _LifecycleStep:
 
     def run_to(self, time: float) -> None:
         """Apply the events that are due until then, the earliest first."""
-        while due := [one for one in self._due_events() if one[0] <= time]:
-            when, event = min(due, key=lambda one: one[0])
+        while due := [pending for pending in self._due_events() if pending[0] <= time]:
+            when, event = min(due, key=lambda candidate: candidate[0])
             # A delay made shorter while it runs may have ended in the past, whose history is already written.
             when, expired = max(when, self.state.at), event is LifecycleEvent.EXPIRE
             self._apply(event, when, render(message("alarm.shelving_expired")) if expired else self.state.cause)
@@ -210,14 +210,14 @@ def evaluate_ne107(
     An alarm that is shelved still counts, since shelving only silences it; one that its design suppresses does not;
     one that is out of service means that somebody works on the asset.
     """
-    found: list[tuple[Ne107, str]] = [(NE107_OF_QUALITY[kind], kind) for kind in quality]
+    statuses: list[tuple[Ne107, str]] = [(NE107_OF_QUALITY[kind], kind) for kind in quality]
     if verdict in NE107_OF_VERDICT:
-        found.append((NE107_OF_VERDICT[verdict], verdict))
+        statuses.append((NE107_OF_VERDICT[verdict], verdict))
     for definition, alarm_state in alarms:
         if alarm_state.state is LifecycleState.OUT_OF_SERVICE:
-            found.append(("function_check", render(message("alarm.out_of_service", alarm=alarm_state.alarm))))
+            statuses.append(("function_check", render(message("alarm.out_of_service", alarm=alarm_state.alarm))))
         elif not alarm_state.suppressed and (alarm_state.active or alarm_state.state in LATCHED_STATES):
-            found.append((definition.ne107, alarm_state.alarm))
-    worst: Ne107 = max((status for status, _ in found), key=SEVERITY.index, default="good")
-    reasons = (reason for status, reason in found if status == worst and worst != "good")
+            statuses.append((definition.ne107, alarm_state.alarm))
+    worst: Ne107 = max((status for status, _ in statuses), key=SEVERITY.index, default="good")
+    reasons = (reason for status, reason in statuses if status == worst and worst != "good")
     return Ne107Status(worst, tuple(dict.fromkeys(reasons)))

@@ -119,8 +119,8 @@ class JsonRecord:
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Self:
         """Return the record that `to_dict` wrote."""
-        found: Self = _adapter(cls).validate_python(plain)  # type: ignore[arg-type]
-        return found
+        record: Self = _adapter(cls).validate_python(plain)  # type: ignore[arg-type]
+        return record
 
 
 class PersistentState(JsonRecord):

@@ -167,13 +167,13 @@ class AlarmSettings(Settings):
     @property
     def asset_alarms(self) -> dict[str, AlarmDefinition]:
         """The alarms that each asset has, by name."""
-        found = [
+        definitions = [
             (n, definition)
             for n, definition in self.definitions.items()
             if definition.enabled and definition.source not in SERVICE_SOURCES
         ]
         # What suppresses comes before what is suppressed, so that both happen in the same step.
-        return dict(sorted(found, key=lambda item: bool(item[1].suppressed_when)))
+        return dict(sorted(definitions, key=lambda item: bool(item[1].suppressed_when)))
 
     @property
     def service_alarms(self) -> dict[str, AlarmDefinition]:

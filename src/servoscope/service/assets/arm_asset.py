@@ -23,6 +23,8 @@ from servoscope.service.assets.residual_history import EvaluationStatus, LatestE
 from servoscope.service.store.rows import coefficient_rows, fault_rows, period_number
 from servoscope.signals import quality
 
+MIN_FILLED = 0.5  # of a window, before it is diagnosed after a pause
+
 
 class ArmAsset(Asset):
     """Follows one arm.
@@ -48,11 +50,14 @@ class ArmAsset(Asset):
         """Ask for the diagnosis of the last minutes if that is due."""
         state = self.take_state()
         t, known = state.position.t, state.examination
-        is_set_back = t < (known.since if known.examined is None else known.examined)
+        is_set_back = t < (known.since if known.examined is None else known.examined) and not state.pending_diagnoses
         if t < known.due and not is_set_back:
             return
-        first = self._window.after(t - self.policy.diagnosis.window_s)[0].sequence
-        window = PendingDiagnosis(self._next_row_number(), first, t, "full")
+        window_s = self.policy.diagnosis.window_s
+        first = self._window.after(t - window_s)[0]
+        if t - first.start_time() < MIN_FILLED * window_s:
+            return
+        window = PendingDiagnosis(self._next_row_number(), first.sequence, t, "full")
         state, due = self.take_state(), t + self.policy.diagnosis.every_s
         pending = (*state.pending_diagnoses, window)
         self.state = replace(state, examination=replace(known, due=due), pending_diagnoses=pending)

@@ -114,10 +114,11 @@ def examine_blocks(
         exam = Examination.from_recording(baseline, recording, quick=True)
     except ServoscopeError as error:
         return undetermined("unusable", error=str(error))
-    if exam.along is not None and (outside := exam.along.outside) is not None:
+    outside, changed = exam.along and exam.along.outside, features is not None and features > 1.0
+    if outside and not changed:
         return undetermined("unusable", error=outside)
-    if not exam.alarm.any():
-        if features is not None and features > 1.0:
+    if outside or not exam.alarm.any():
+        if changed:
             headline = message("service.examination.features", excess=features)
             return StoredDiagnosis(verdict="fault", headline=headline, onset=None)
         if known is not None:

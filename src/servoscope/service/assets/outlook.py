@@ -53,7 +53,7 @@ class Outlook(BaseModel):
     @classmethod
     def from_prognosis(cls, found: Prognosis, asked: float) -> Self:
         """Return what is kept of a prognosis."""
-        reach = tuple(None if each is None else found.to_t + each for each in found.remaining_s or ())
+        reach = tuple(None if remaining is None else found.to_t + remaining for remaining in found.remaining_s or ())
         return cls.model_validate(
             {
                 **{key: getattr(found, key) for key in ("name", "limit", "outlook", "rate_per_day", "summary")},

@@ -28,7 +28,7 @@ class RecentBlocks:
         self._asset, self._span_s, self._most = asset, span_s, 2.0 * span_s * rate
         self._blocks = deque[PackedBlock]()
         self._samples = 0
-        for _, alike in groupby(blocks, key=lambda one: one.signals.shape):
+        for _, alike in groupby(blocks, key=lambda block: block.signals.shape):
             own = list(alike)
             for block, packed in zip(own, pack_samples(np.stack([block.signals for block in own])), strict=True):
                 self.append((block.sequence, block.t.item(0), block.t.item(-1), block.t.size, *packed))
@@ -57,7 +57,7 @@ class RecentBlocks:
     def within(self, pending: PendingDiagnosis) -> list[Block]:
         """Return the blocks that a full diagnosis looks at."""
         generator = (block for block in self._blocks if block[0] >= pending.first and block[1] < pending.until)
-        return [self._unpack(one[0], *one[4:]) for one in generator]
+        return [self._unpack(entry[0], *entry[4:]) for entry in generator]
 
     def trim(self, t: float, pending: Collection[PendingDiagnosis]) -> None:
         """Drop what is not needed at `t` [UTC s] any more; also where the clock was set back."""

@@ -41,11 +41,11 @@ def audit_row(event: str, document: dict[str, Any], user: str = "servoscope") ->
     return TableRow("audit", {"who": user, "what": event, "document": document})
 
 
-def transition_row(one: AlarmTransition, definition: AlarmDefinition) -> dict[str, Any]:
+def transition_row(transition: AlarmTransition, definition: AlarmDefinition) -> dict[str, Any]:
     """Return a transition as the store keeps it, without its number."""
-    plain = one.to_dict()
+    plain = transition.to_dict()
     columns = {key: plain[key] for key in ("alarm", "before", "after", "cause", "who")}
-    return {"t": one.time, **columns, "document": {"event": plain["event"], "priority": definition.priority}}
+    return {"t": transition.time, **columns, "document": {"event": plain["event"], "priority": definition.priority}}
 
 
 class BlockContinuity(NamedTuple):

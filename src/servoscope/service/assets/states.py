@@ -83,7 +83,7 @@ class AssetStates:
         # the newest evaluations of each asset, since its state is here; its column `lane` says which of them
         self._evaluations = np.full(assets, None, dtype=object)
 
-    def put(self, row: int, state: AssetState, rest: RestPeriod) -> StateRow:
+    def put(self, row: int, state: AssetState, period: RestPeriod) -> StateRow:
         """Write a state into a row."""
         position, history, evaluation = state.position, state.history, state.evaluation
         self.columns[row] = (
@@ -92,7 +92,7 @@ class AssetStates:
             position.rows,
             *(state.samples, _number(state.last_t), _number(evaluation.t), evaluation.exceeded),
             *(_number(history.period), history.excess, history.level, _number(state.alarms_at)),
-            *(0, *rest),
+            *(0, *period),
         )
         self.monitor[row], self.quality[row], self._evaluations[row] = state.monitor, state.quality, None
         return StateRow(self, row)
@@ -107,11 +107,11 @@ class AssetStates:
         position, evaluations = self.read_position(row, before.position), self._evaluations[row]
         if position is before.position:
             return before
-        one = dict(zip(COLUMNS.names or (), self.columns[row].item(), strict=True))
+        record = dict(zip(COLUMNS.names or (), self.columns[row].item(), strict=True))
         history, latest = before.history, before.evaluation
         if evaluations is not None:
-            history = HistoryState(int(one["period"]), one["excess"], one["level"])
-            latest = evaluations.latest(one["lane"])
+            history = HistoryState(int(record["period"]), record["excess"], record["level"])
+            latest = evaluations.latest(record["lane"])
         return evolve(
             before,
             monitor=self.monitor[row].copy(),
@@ -119,7 +119,7 @@ class AssetStates:
             position=position,
             history=history,
             evaluation=latest,
-            **{key: one[key] for key in ("samples", "last_t", "alarms_at")},
+            **{key: record[key] for key in ("samples", "last_t", "alarms_at")},
         )
 
     def read_position(self, row: int, before: StreamPosition) -> StreamPosition:
@@ -159,8 +159,8 @@ class AssetStates:
         numbers, history = columns["blocks"].tolist(), list[tuple[int, TableRow]]()
         columns["t"] = columns["last_t"] = columns["alarms_at"] = output.t[lanes]
         columns["digest"] = [zlib.crc32(tail, zlib.crc32(numbers_of[lane], before)) for lane, before in digests]
-        for name, more in (("sequence", 1), ("blocks", 1), ("counted", output.size), ("samples", output.size)):
-            columns[name] += more
+        for name, increment in (("sequence", 1), ("blocks", 1), ("counted", output.size), ("samples", output.size)):
+            columns[name] += increment
         if new is not None:
             before = np.stack([columns["excess"], columns["level"]])
             (columns["excess"], columns["level"]), complete = new.update_histories(lanes, columns["period"], before)

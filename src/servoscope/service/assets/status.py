@@ -154,11 +154,10 @@ def read_status(stored: Mapping[str, Any]) -> AssetStatus | ServiceStatus:
 
 def asset_metadata(baseline: AnyBaseline, group: str, window_s: float, source: str = "") -> AssetMetadata:
     """Return the metadata of an asset with this baseline."""
-    kind: dict[str, Any] = {
-        "plant": "arm",
-        "faults": dict(zip(baseline.fault_names, baseline.fault_names, strict=True)),
-    }
-    if not isinstance(baseline, ArmBaseline):
+    kind: dict[str, Any] = {"plant": "arm", "faults": {name: name for name in baseline.fault_names}}
+    if isinstance(baseline, ArmBaseline):
+        kind["coefficient_units"] = baseline.coefficient_units
+    else:
         plant = baseline.loop.plant
         units = {"units": tuple(plant.units), "coefficient_units": tuple(plant.coefficient_units)}
         faults = {fault.name: fault.words for fault in plant.all_faults}

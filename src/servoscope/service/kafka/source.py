@@ -72,7 +72,7 @@ class KafkaSourceSettings(TlsSettings, SourceSettings):
 
     def client_settings(self, name: str, folder: Path) -> dict[str, Any]:
         """Return what the client library calls these settings."""
-        found: dict[str, Any] = {
+        settings: dict[str, Any] = {
             "bootstrap.servers": ",".join(self.brokers),
             "group.id": self.client or name,
             "enable.auto.commit": False,
@@ -84,14 +84,14 @@ class KafkaSourceSettings(TlsSettings, SourceSettings):
         protocol = "SSL" if self.tls else "PLAINTEXT"
         if self.user is not None:
             password = read_password(self.password_file, folder) or ""
-            found |= {"sasl.mechanism": "PLAIN", "sasl.username": self.user, "sasl.password": password}
+            settings |= {"sasl.mechanism": "PLAIN", "sasl.username": self.user, "sasl.password": password}
             protocol = f"SASL_{protocol}"
         files = {"ssl.ca.location": self.ca_file, "ssl.certificate.location": self.cert_file}
         files["ssl.key.location"] = self.key_file
         given = {key: str(folder / name) for key, name in files.items() if name is not None}
         if given and not self.tls:
             raise ConfigError("certificates are given, but not tls = true")
-        return found | given | {"security.protocol": protocol}
+        return settings | given | {"security.protocol": protocol}
 
 
 class _PartitionOffsets:
@@ -141,8 +141,8 @@ class KafkaTransport(ThreadTransport):
                 full = sum(len(offset.open) for offset in self._offsets.values()) >= self.settings.in_flight
             if full:  # it must still be called, or the group takes it for dead
                 consumer.pause(consumer.assignment())
-            for one in consumer.consume(AT_ONCE, FETCH_S):
-                self._receive(one)
+            for record in consumer.consume(AT_ONCE, FETCH_S):
+                self._receive(record)
             if full:
                 consumer.resume(consumer.assignment())
             self._commit(consumer, committed)
@@ -165,13 +165,13 @@ class KafkaTransport(ThreadTransport):
             for partition in partitions:
                 self._offsets.pop((partition.topic, partition.partition), None)
 
-    def _receive(self, one: Any) -> None:
-        if one.error() is not None:
-            self._note_error(one.error())
+    def _receive(self, record: Any) -> None:
+        if record.error() is not None:
+            self._note_error(record.error())
             return
         self.trouble, self.connected = "", True
-        topic, partition, offset = one.topic(), one.partition(), one.offset()
-        key, content = one.key(), one.value() or b""
+        topic, partition, offset = record.topic(), record.partition(), record.offset()
+        key, content = record.key(), record.value() or b""
         address = f"{topic}/{key.decode(errors='replace')}" if key else topic
         with self._lock:
             offsets = self._offsets.setdefault((topic, partition), _PartitionOffsets())

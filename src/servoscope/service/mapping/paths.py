@@ -45,10 +45,10 @@ class TextPattern:
 
     def match(self, text: str) -> dict[str, str] | None:
         """Return what the names stand for; None where the text is another one, or longer than `MAX_TEXT_CHARS`."""
-        found = self._regex.fullmatch(text) if len(text) <= MAX_TEXT_CHARS else None
-        if found is None:
+        match = self._regex.fullmatch(text) if len(text) <= MAX_TEXT_CHARS else None
+        if match is None:
             return None
-        names = found.groupdict()
+        names = match.groupdict()
         if self._shared:
             levels = text.split("/")
             if not all(_match_level(parts, levels[k], names) for k, parts in self._shared.items()):
@@ -57,11 +57,11 @@ class TextPattern:
 
     def filters(self, values: Mapping[str, frozenset[str]]) -> set[str]:
         """Return the topics to subscribe to: with the `values` of names that have some, and any level for others."""
-        found = {self.text}
+        patterns = {self.text}
         for name in self.names:
             choices = values.get(name, {f"{{{name}}}"})
-            found = {text.replace(f"{{{name}}}", value) for text in found for value in choices}
-        return {"/".join("+" if NAME.search(level) else level for level in text.split("/")) for text in found}
+            patterns = {text.replace(f"{{{name}}}", value) for text in patterns for value in choices}
+        return {"/".join("+" if NAME.search(level) else level for level in text.split("/")) for text in patterns}
 
 
 def _match_level(parts: list[str], level: str, found: dict[str, str]) -> bool:
@@ -116,8 +116,8 @@ class RowPath:
     ) -> Iterator[tuple[list[Any], dict[str, str]]]:
         if depth == len(self._steps):
             if isinstance(tree, list):
-                for one in tree:
-                    yield [one, *around], names
+                for element in tree:
+                    yield [element, *around], names
             elif tree is not MISSING:
                 yield around, names
             return
@@ -125,18 +125,18 @@ class RowPath:
         name = NAME.fullmatch(step)
         if name or step == "*":
             entries = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
-            for key, one in entries:
-                found = {**names, name[1]: str(key)} if name else names
-                yield from self._walk(one, depth + 1, [one, *around], found)
+            for key, element in entries:
+                bound = {**names, name[1]: str(key)} if name else names
+                yield from self._walk(element, depth + 1, [element, *around], bound)
         else:
-            one = find(tree, split_path(step))
-            if one is not MISSING:
-                yield from self._walk(one, depth + 1, [one, *around], names)
+            element = find(tree, split_path(step))
+            if element is not MISSING:
+                yield from self._walk(element, depth + 1, [element, *around], names)
 
 
 def find_around(around: list[Any], path: tuple[str | int, ...]) -> Any:
     """Return what is at a path in a row, or else in what encloses it."""
     for tree in around:
-        if (found := find(tree, path)) is not MISSING:
-            return found
+        if (value := find(tree, path)) is not MISSING:
+            return value
     return MISSING

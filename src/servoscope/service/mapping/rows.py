@@ -73,12 +73,13 @@ class MessageMapping(Decoder):
         self._rows = RowPath(settings.rows)
         self._match = [(split_path(path), TextPattern(text)) for path, text in settings.match.items()]
         self._good = [
-            (split_path(path), one if isinstance(one, list) else [one]) for path, one in settings.good.items()
+            (split_path(path), good_values if isinstance(good_values, list) else [good_values])
+            for path, good_values in settings.good.items()
         ]
         self._time = [(split_path(path), unit) for path, unit in settings.time.items()]
         zone = settings.time_zone
         self._zones = {name: ZoneOffset(zone) for name in rates} if zone is not None else {}  # each has a last time
-        self._fields = [split_path(one) for one in settings.fields.all]
+        self._fields = [split_path(field) for field in settings.fields.all]
         self._by_name = {name: k for k, name in enumerate(settings.fields.all)} if settings.has_signal_names else {}
         self._value = split_path(settings.value)
         scale = settings.scale
@@ -116,9 +117,9 @@ class MessageMapping(Decoder):
         names: dict[str, str] = {}
         for path, pattern in self._match:
             if path == ("name",):
-                if (found := pattern.match(metric)) is None:
+                if (bound := pattern.match(metric)) is None:
                     return False
-                names |= found
+                names |= bound
         return all(name not in names or names[name] in known for name, known in self._known_names)
 
     def find_asset(self, topic: str) -> str:
@@ -128,7 +129,7 @@ class MessageMapping(Decoder):
 
     def _match_topic(self, topic: str) -> dict[str, str] | None:
         """Return what the names of the first pattern that fits stand for."""
-        return next((found for text_pattern in self._topics if (found := text_pattern.match(topic)) is not None), None)
+        return next((match for text_pattern in self._topics if (match := text_pattern.match(topic)) is not None), None)
 
     def decode(self, message: InboxMessage) -> Content:
         """Return the values of a message; what has no time stamp was measured when it came."""
@@ -145,13 +146,13 @@ class MessageMapping(Decoder):
         tree, gone = self._decode(names, message)
         values: dict[str, list[SignalValue]] = {}
         extra, complete, rows, bad = set[str](), True, 0, 0
-        for around, found in self._rows.rows(tree):
+        for around, bound in self._rows.rows(tree):
             rows += 1
             if rows > MAX_ROWS or bad > MAX_BAD_ROWS:
                 why = f"{MAX_ROWS} rows" if rows > MAX_ROWS else f"{bad} rows that cannot be used"
                 self._reject(self.find_asset(topic), "rows", f"all that is behind {why} of a message is left out")
                 break
-            row_names = self._match_row(around, {**names, **found})
+            row_names = self._match_row(around, {**names, **bound})
             asset = self._only if row_names is not None else ""
             if row_names is not None and ASSET in row_names:
                 asset = self._assets.get(row_names[ASSET], "")
@@ -196,9 +197,9 @@ class MessageMapping(Decoder):
         """Return what all names of a row stand for; None where its texts are others."""
         for path, pattern in self._match:
             text = find_around(around, path)
-            if not isinstance(text, str | int) or (found := pattern.match(str(text))) is None:
+            if not isinstance(text, str | int) or (bound := pattern.match(str(text))) is None:
                 return None
-            names |= found
+            names |= bound
         return names
 
     def _read_signals(self, around: list[Any], names: dict[str, str], extra: set[str]) -> dict[int, Any]:
@@ -215,8 +216,8 @@ class MessageMapping(Decoder):
         table = find(around[0], self._table) if self._table is not None else None
         if isinstance(table, dict):
             extra.update(f"field {key!r}" for key in table.keys() - self._expected)
-        found = {k: find(around[0], path) for k, path in enumerate(self._fields)}
-        signals = {k: value for k, value in found.items() if value is not MISSING}
+        values = {k: find(around[0], path) for k, path in enumerate(self._fields)}
+        signals = {k: value for k, value in values.items() if value is not MISSING}
         if not signals:
             wanted = ", ".join(self.settings.fields.all)
             raise MessageError("keys", f"none of {wanted} is there, {describe_keys(around[0])}")
@@ -266,14 +267,14 @@ class MessageMapping(Decoder):
                 where = ".".join(map(str, path))
                 raise MessageError("times", f"no time stamp at {where!r}, {describe_keys(around[0])}")
             if isinstance(stamp, list):
-                many = [self._parse_time(one, unit, asset) for one in stamp]
+                many = [self._parse_time(entry, unit, asset) for entry in stamp]
                 before = total if isinstance(total, list) else [total] * len(many)
                 if len(before) != len(many):
                     raise MessageError("lengths", "time stamps of different numbers")
-                total = [one + other for one, other in zip(before, many, strict=True)]
+                total = [time + other for time, other in zip(before, many, strict=True)]
             else:
-                one = self._parse_time(stamp, unit, asset)
-                total = [other + one for other in total] if isinstance(total, list) else total + one
+                moment = self._parse_time(stamp, unit, asset)
+                total = [other + moment for other in total] if isinstance(total, list) else total + moment
         if not all(0.0 <= t < MAX_TIME_S for t in (total if isinstance(total, list) else [total])):
             raise MessageError("times", "a time stamp outside of the years 1970 to 9999: is its unit right?")
         return total

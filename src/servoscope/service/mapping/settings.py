@@ -133,7 +133,7 @@ class PayloadSettings(Settings):
     @property
     def _row_names(self) -> frozenset[str]:
         """Names in the path to the rows, and in the patterns of their texts."""
-        return RowPath(self.rows).names.union(*(TextPattern(one).names for one in self.match.values()))
+        return RowPath(self.rows).names.union(*(TextPattern(pattern).names for pattern in self.match.values()))
 
     @property
     def _names(self) -> frozenset[str]:

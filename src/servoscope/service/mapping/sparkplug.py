@@ -48,11 +48,15 @@ def payload_class() -> Any:
     for name, fields in FIELDS.items():
         made = file.message_type.add(name=name)
         for key, number, kind in fields:
-            one = made.field.add(name=key, number=number, label=kinds.LABEL_OPTIONAL)
+            field = made.field.add(name=key, number=number, label=kinds.LABEL_OPTIONAL)
             if kind in FIELDS:
-                one.label, one.type, one.type_name = kinds.LABEL_REPEATED, kinds.TYPE_MESSAGE, f".servoscope.{kind}"
+                field.label, field.type, field.type_name = (
+                    kinds.LABEL_REPEATED,
+                    kinds.TYPE_MESSAGE,
+                    f".servoscope.{kind}",
+                )
             else:
-                one.type = getattr(kinds, f"TYPE_{kind}")
+                field.type = getattr(kinds, f"TYPE_{kind}")
     pool = descriptor_pool.DescriptorPool()  # of our own: other packages may know the same messages by other names
     pool.Add(file)
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("servoscope.Payload"))
@@ -176,7 +180,7 @@ def _row(metric: Any, about: _Node | None, sent: int) -> dict[str, Any] | None:
     known = about.metrics.get(metric.name or metric.alias) if about is not None else None
     name, datatype = known or (metric.name, metric.datatype)
     value: float | None = None
-    number = next((one for one in NUMBERS if metric.HasField(one)), None)
+    number = next((kind for kind in NUMBERS if metric.HasField(kind)), None)
     if not name or (number is None and not metric.is_null):
         return None  # a text, a template; an alias that its birth has given to what is not mapped
     if number is not None and not metric.is_null:
@@ -189,8 +193,8 @@ def _row(metric: Any, about: _Node | None, sent: int) -> dict[str, Any] | None:
 
 
 def _birth_number(payload: Any) -> int:
-    found = [metric for metric in payload.metrics if metric.name == SEQUENCE]
-    return int(found[0].long_value or found[0].int_value) if found else -1
+    sequences = [metric for metric in payload.metrics if metric.name == SEQUENCE]
+    return int(sequences[0].long_value or sequences[0].int_value) if sequences else -1
 
 
 def encode_rebirth(now: float) -> bytes:

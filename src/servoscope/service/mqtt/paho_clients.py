@@ -68,9 +68,15 @@ class BulkClient(CheckedClient):
         self._acks, self._acks_lock = list[bytes](), threading.Lock()
         self._read_at, self._gather_s = 0.0, 0.0  # when the socket was read, and how long it is left alone from then on
         self._is_empty, self.empty_at, self.thread_s = True, 0.0, 0.0
-        self.on_message = lambda _client, _data, one: on_received(
-            # not `one.topic`, which raises where it is no UTF-8, and so ends paho's thread
-            ReceivedMessage(one._topic.decode("utf-8", "replace"), bytes(one.payload), one.qos, one.mid, one.retain)
+        self.on_message = lambda _client, _data, message: on_received(
+            # not `message.topic`, which raises where it is no UTF-8, and so ends paho's thread
+            ReceivedMessage(
+                message._topic.decode("utf-8", "replace"),
+                bytes(message.payload),
+                message.qos,
+                message.mid,
+                message.retain,
+            )
         )
 
     def ack(self, mid: int, qos: int) -> MQTTErrorCode:

@@ -145,7 +145,9 @@ def _decode_regular(asset: str, message: bytes, received_at: float) -> Block | N
     return _build_block(asset, stream, sequence, oldest if "oldest" in keys else None, signals, received_at)
 
 
-def _decode_json(asset: str, message: bytes, received_at: float, covariates: Sequence[str], *, is_arm: bool) -> Block:
+def _decode_json(
+    asset: str, message: bytes, received_at: float, covariates: Sequence[str], *, is_arm: bool = False
+) -> Block:
     try:
         plain = parse_json(message)
     except (ValueError, RecursionError) as error:

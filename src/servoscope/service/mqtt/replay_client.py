@@ -143,15 +143,15 @@ class ReplayClient(BrokerConnection):
 
         Raises SourceError if the service has a later stream than this one.
         """
-        found: dict[str, int] = {}
+        acknowledged: dict[str, int] = {}
         for _ in range(self._acks.qsize()):
             asset, stream, sequence = self._acks.get()
             if stream > self._stream:
                 began = datetime.fromtimestamp(stream / 1e6, UTC).isoformat()
                 raise SourceError(f"{asset}: the service has a stream that began at {began}: give a later start")
             if stream == self._stream:
-                found[asset] = max(sequence, found.get(asset, -1))
-        return found
+                acknowledged[asset] = max(sequence, acknowledged.get(asset, -1))
+        return acknowledged
 
     def _run_once(self) -> None:
         now = time.monotonic()
@@ -201,16 +201,18 @@ class ReplayClient(BrokerConnection):
             message = payload.encode_json(block, oldest, self._covariates[block.asset])
         blocks.append(_UnacknowledgedBlock(block.sequence, message))
 
-    def _send(self, asset: str, one: _UnacknowledgedBlock) -> None:
+    def _send(self, asset: str, message: _UnacknowledgedBlock) -> None:
         """Send a block, unless the client is still sending it to the broker itself."""
         try:
-            sending = one.publish_info is not None and not one.publish_info.is_published()
+            sending = message.publish_info is not None and not message.publish_info.is_published()
         except RuntimeError:  # it was handed over while the connection broke: unknown, and twice does no harm
             sending = False
         if not sending:
-            self.repeated += one.publish_info is not None
-            one.first_sent_at = time.monotonic() if one.publish_info is None else None
-            one.publish_info = self._client.publish(topics.data_topic(self.settings.topic, asset), one.message, qos=1)
+            self.repeated += message.publish_info is not None
+            message.first_sent_at = time.monotonic() if message.publish_info is None else None
+            message.publish_info = self._client.publish(
+                topics.data_topic(self.settings.topic, asset), message.message, qos=1
+            )
 
     def _on_change(self, accepted: bool) -> None:
         from paho.mqtt.subscribeoptions import SubscribeOptions

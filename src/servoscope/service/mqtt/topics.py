@@ -42,9 +42,9 @@ def decode_ack(message: bytes) -> tuple[int, int]:
     """Return stream and sequence of the last block acknowledged; raises MessageError if it is another message."""
     try:
         plain = json.loads(message)
-        found = plain["stream"], plain["sequence"]
+        acknowledged = plain["stream"], plain["sequence"]
     except (ValueError, RecursionError, TypeError, KeyError):
         raise MessageError("not an acknowledgement", "no JSON object with stream and sequence") from None
-    if any(type(x) is not int or not -1 <= x <= MAX_COUNT for x in found):
+    if any(type(x) is not int or not -1 <= x <= MAX_COUNT for x in acknowledged):
         raise MessageError("not an acknowledgement", "stream and sequence must be whole numbers")
-    return found
+    return acknowledged

@@ -85,9 +85,9 @@ def describe_expiry(client: Any, folder: Path, settings: CertificateSettings, no
     """
     from cryptography import x509
 
-    found = {"our": settings.certificate_bytes(folder), "server": client.security_policy.peer_certificate}
+    certificates = {"our": settings.certificate_bytes(folder), "server": client.security_policy.peer_certificate}
     words = []
-    for whose, raw in found.items():
+    for whose, raw in certificates.items():
         load = x509.load_pem_x509_certificate if raw and raw.startswith(b"-----") else x509.load_der_x509_certificate
         with suppress(ValueError):  # none, a chain, or a form that cannot be read: the connection was accepted with it
             end = load(raw or b"").not_valid_after_utc

@@ -171,7 +171,7 @@ class OpcuaTransport(ThreadTransport):
             if nodes.block is not None:
                 self._subscriptions.append(ArraySubscription(name, [nodes.block], at, *common, wanted))
             else:
-                signals = [*nodes.signals, *(nodes.covariates[one] for one in wanted)]
+                signals = [*nodes.signals, *(nodes.covariates[covariate] for covariate in wanted)]
                 size = max(1, round(self.settings.block * rate))
                 self._subscriptions.append(ScalarSubscription(name, signals, at, *common, rate, size, wanted))
         super().open(resume)
@@ -207,9 +207,9 @@ class OpcuaTransport(ThreadTransport):
         from asyncua import ua
 
         by_node: dict[Any, list[tuple[ArraySubscription | ScalarSubscription, int]]] = {}
-        for one in self._subscriptions:
-            for k, node in enumerate(one.nodes):
-                by_node.setdefault(ua.NodeId.from_string(node), []).append((one, k))
+        for feed in self._subscriptions:
+            for k, node in enumerate(feed.nodes):
+                by_node.setdefault(ua.NodeId.from_string(node), []).append((feed, k))
         values: deque[tuple[Any, Any]] = deque()
         handler, period = _SubscriptionHandler(values), self.settings.publishing_s
         subscription = await client.create_subscription(1000.0 * period, handler)
@@ -217,8 +217,8 @@ class OpcuaTransport(ThreadTransport):
         period = await self._subscribe(subscription, grants)
         heartbeat = ua.NodeId.from_string(self.settings.heartbeat)
         now = _parse_heartbeat(await client.get_node(heartbeat).read_data_value())
-        for one in self._subscriptions:
-            await one.read_missed(client, now)
+        for feed in self._subscriptions:
+            await feed.read_missed(client, now)
         self.connected, self._last_heartbeat = True, time.monotonic()
         self.trouble = describe_expiry(client, self._folder, self.settings, datetime.now(UTC))
         retry_at = time.monotonic() + RETRY_NODES_S
@@ -229,14 +229,14 @@ class OpcuaTransport(ThreadTransport):
                 node, value = values.popleft()
                 if node == heartbeat:
                     self._server_time, self._last_heartbeat = _parse_heartbeat(value), time.monotonic()
-                for one, k in by_node.get(node, ()):
-                    one.add_value(k, value)
+                for feed, k in by_node.get(node, ()):
+                    feed.add_value(k, value)
             if time.monotonic() - self._last_heartbeat > self.settings.heartbeat_s:
                 raise ConnectionError(f"no heartbeat for {self.settings.heartbeat_s:g} s")
             if handler.end_status:
                 raise ConnectionError(f"the server has ended the subscription ({handler.end_status})")
-            for one in self._subscriptions:
-                one.emit_blocks(self._server_time - max(SETTLING_S, 4.0 * period))
+            for feed in self._subscriptions:
+                feed.emit_blocks(self._server_time - max(SETTLING_S, 4.0 * period))
             missing = any(grant.refusal for grant in grants.values())
             if missing and time.monotonic() >= retry_at:  # the PLC may have been given its program meanwhile
                 retry_at = time.monotonic() + RETRY_NODES_S
@@ -267,8 +267,8 @@ class OpcuaTransport(ThreadTransport):
         )
         if longest < period:
             period = await shorten_interval(subscription, longest / QUEUE_MARGIN)
-        for one in changed:
-            one.check_grants(grants, period)
+        for feed in changed:
+            feed.check_grants(grants, period)
         return period
 
 

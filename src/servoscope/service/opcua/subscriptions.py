@@ -96,15 +96,15 @@ async def shorten_interval(subscription: Any, interval_s: float) -> float:
     """Ask for messages that come so much sooner [s]; return what is granted."""
     from asyncua import ua
 
-    one = subscription.parameters
+    parameters = subscription.parameters
     answer = await subscription.update(
         ua.ModifySubscriptionParameters(
             SubscriptionId=subscription.subscription_id,
             RequestedPublishingInterval=1000.0 * interval_s,
-            RequestedLifetimeCount=one.RequestedLifetimeCount,
-            RequestedMaxKeepAliveCount=one.RequestedMaxKeepAliveCount,
-            MaxNotificationsPerPublish=one.MaxNotificationsPerPublish,
-            Priority=one.Priority,
+            RequestedLifetimeCount=parameters.RequestedLifetimeCount,
+            RequestedMaxKeepAliveCount=parameters.RequestedMaxKeepAliveCount,
+            MaxNotificationsPerPublish=parameters.MaxNotificationsPerPublish,
+            Priority=parameters.Priority,
         )
     )
     return float(answer.RevisedPublishingInterval) / 1000.0

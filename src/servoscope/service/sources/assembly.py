@@ -101,8 +101,8 @@ class BlockAssembler:
     @property
     def intervals_s(self) -> dict[str, float]:
         """Time between two updates of each signal, as measured [s]; without those of which too few have come."""
-        found = {name: rate.interval_s for name, rate in zip(self.signals, self.rates, strict=True)}
-        return {name: interval for name, interval in found.items() if not math.isnan(interval)}
+        intervals = {name: rate.interval_s for name, rate in zip(self.signals, self.rates, strict=True)}
+        return {name: interval for name, interval in intervals.items() if not math.isnan(interval)}
 
     @property
     def slow_ms(self) -> dict[int, float]:
@@ -140,13 +140,13 @@ class BlockAssembler:
 
     def take_blocks(self, *, short: bool = False) -> list[Block]:
         """Return the blocks that are complete; also what is left of samples if they may be `short`."""
-        found = []
+        blocks = []
         while self._t.size >= (1 if short else self._size):
             self._sequence += 1
             signals = np.vstack([self._t[: self._size], self._values[:, : self._size]])
-            found.append(Block.from_signals(self.asset, self._sequence, signals, time.monotonic()))
+            blocks.append(Block.from_signals(self.asset, self._sequence, signals, time.monotonic()))
             self._t, self._values = self._t[self._size :], self._values[:, self._size :]
-        return found
+        return blocks
 
     @property
     def buffered(self) -> int:
@@ -212,7 +212,7 @@ class AssetStream(BlockAssembler):
         size = max(1, round(block_s * rate))
         super().__init__(asset, resume, rejections, rate, size, hold_s, covariates)
         self._span_s = (size - 0.5) / rate
-        self._places = [self.signals.index(one) if one in self.signals else -1 for one in (*SIGNALS, *known)]
+        self._places = [self.signals.index(signal) if signal in self.signals else -1 for signal in (*SIGNALS, *known)]
         self.open = deque[_OpenMessage]()
         self._seen: dict[int, None] = {}
         self.trouble: Reception | None = None

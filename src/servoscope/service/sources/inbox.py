@@ -169,10 +169,10 @@ class Inbox:
     def _take(self, messages: Sequence[InboxMessage]) -> Iterator[bool]:
         """Take messages one by one, and block by block; yield whether to go on now."""
         is_guarded = self._guard is not None
-        found = self._decode_guarded(messages) if is_guarded else map(self.decoder.try_decode, messages)
+        decoded = self._decode_guarded(messages) if is_guarded else map(self.decoder.try_decode, messages)
         for message in messages:
             yield True
-            while (content := next(found)) is None:
+            while (content := next(decoded)) is None:
                 yield False
             for address, request in self.decoder.requests():
                 self.transport.send(address, request)

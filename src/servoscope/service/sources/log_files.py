@@ -100,14 +100,14 @@ class FileNames:
         self._only = "" if by_column or not assets else next(iter(assets))
         called = "|".join(re.escape(name) for name in sorted(self.assets, key=len, reverse=True))
         parts = {"{asset}": f"(?P<asset>{called})", "{time}": r"(?P<time>\d[\d T_.:-]*)", "*": "[^/]*"}
-        self._regex = re.compile("".join(parts.get(one, re.escape(one)) for one in NAME_PARTS.split(settings.match)))
+        self._regex = re.compile("".join(parts.get(part, re.escape(part)) for part in NAME_PARTS.split(settings.match)))
         self._ignored = settings.ignore
         self.depth = settings.match.count("/")  # of folders in the folder
 
     def match(self, name: str) -> tuple[str, str] | None:
         """Return the asset and the time that a name says, empty where it says none; None: it is another file's."""
         match = self._regex.fullmatch(name)
-        if match is None or any(fnmatch.fnmatch(name.rpartition("/")[2], one) for one in self._ignored):
+        if match is None or any(fnmatch.fnmatch(name.rpartition("/")[2], pattern) for pattern in self._ignored):
             return None
         groups = match.groupdict(default="")
         return self.assets[groups["asset"]] if "asset" in groups else self._only, groups.get("time", "")

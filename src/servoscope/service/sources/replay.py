@@ -46,10 +46,10 @@ class ReplaySettings(SourceSettings):
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> Inbox:
         """Return the source of these recordings."""
         files = {
-            each: (tuple(Path(file) if is_address(file) else folder / file for file in asset.address), asset.loop)
-            for each, asset in assets.items()
+            asset_name: (tuple(Path(file) if is_address(file) else folder / file for file in asset.address), asset.loop)
+            for asset_name, asset in assets.items()
         }
-        covariates = {each: asset.covariates for each, asset in assets.items()}
+        covariates = {asset_name: asset.covariates for asset_name, asset in assets.items()}
         return Inbox(ReplayTransport(self, files, covariates), BlockDecoder(), assets)
 
 
@@ -82,10 +82,10 @@ class ReplayStream:
 
     def block(self, asset: str, sequence: int, stream_start: float) -> Block | None:
         """Return a block of the stream that began at `stream_start` [UTC s]; None behind the end."""
-        found = self.locate(sequence)
-        if found is None:
+        place = self.locate(sequence)
+        if place is None:
             return None
-        recording, rows, start = found
+        recording, rows, start = place
         t = stream_start + start + (recording.t[rows] - recording.t[0])
         carried = [recording.channels[name][rows] for name in self.covariates]
         signals = np.stack([t, recording.r[rows], recording.u[rows], recording.y[rows], *carried])

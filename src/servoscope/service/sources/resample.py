@@ -89,7 +89,7 @@ class Resampler:
     @property
     def pending_times(self) -> list[float]:
         """Times of values of which no sample was made yet, in no order [UTC s]."""
-        return [one[0] for one in self._pending]
+        return [value[0] for value in self._pending]
 
     def take_samples(self, alive_until: float, settled: float | None = None) -> ResampledSignals:
         """Return the samples that are complete: those older than the newest value, and all up to `alive_until` [UTC s].
@@ -132,11 +132,11 @@ class Resampler:
     def take_covariates(self) -> None:
         """Take the covariates that wait for a sample: the next one has the newest of them."""
         waiting, self._pending = sorted(self._pending), []
-        for one in waiting:
-            if one[2] < self._signals:
-                self._pending.append(one)  # in order, which makes a heap
+        for value in waiting:
+            if value[2] < self._signals:
+                self._pending.append(value)  # in order, which makes a heap
             else:
-                self._take_covariate(one[0], *one[2:])
+                self._take_covariate(value[0], *value[2:])
 
     def _take_covariate(self, t: float, signal: int, value: float) -> None:
         is_set_back = self._hold_s == math.inf and t < self._value_t[signal] - CLOCK_STEP_S

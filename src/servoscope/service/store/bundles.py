@@ -129,7 +129,9 @@ def pack_samples(signals: FloatArray) -> list[tuple[bytes, bool]]:
         regular = ((first + np.arange(n) / rate).view(np.int64) == t.view(np.int64)).all(axis=1)
     short = np.concatenate([first, rate, numbers[:, 1:].reshape(count, -1)], axis=1)
     stored = (short[i] if is_regular else numbers[i] for i, is_regular in enumerate(regular.tolist()))
-    return [(one.tobytes() + tail, is_regular) for one, is_regular in zip(stored, regular.tolist(), strict=True)]
+    return [
+        (samples_.tobytes() + tail, is_regular) for samples_, is_regular in zip(stored, regular.tolist(), strict=True)
+    ]
 
 
 def restore_times(stored: bytes) -> bytes:
@@ -166,7 +168,7 @@ def read_samples(
     for asset in assets:
         of_bundle[bundle_number(asset)].append(asset)
     for bundle, names in of_bundle.items():
-        found: dict[str, list[tuple[int, bytes]]] = {name: [] for name in names}
+        blocks_by_asset: dict[str, list[tuple[int, bytes]]] = {name: [] for name in names}
         alone = connection.execute(sa.select(tables.recent).where(tables.recent.c.asset.in_(names)))
         first = dict.fromkeys(names, 0)
         contents: dict[tuple[str, int], list[BundlePart]] = {}
@@ -175,9 +177,9 @@ def read_samples(
             rows = sa.select(*_columns("owner", "number", "contents")).where(tables.bundles.c.bundle == bundle)
             contents = {(of, number): _read_contents(text) for of, number, text in connection.execute(rows)}
         for asset, sequence, samples in alone:
-            found[asset].append((sequence, samples))
+            blocks_by_asset[asset].append((sequence, samples))
         if newest is not None:
-            sequences = {name: [sequence for sequence, _ in found[name]] for name in names}
+            sequences = {name: [sequence for sequence, _ in blocks_by_asset[name]] for name in names}
             for asset, sequence, *_ in chain.from_iterable(contents.values()):
                 if asset in sequences:
                     sequences[asset].append(sequence)
@@ -185,9 +187,9 @@ def read_samples(
         for (owner, number), parts in contents.items():
             if any(sequence >= first.get(asset, math.inf) for asset, sequence, *_ in parts):
                 for asset, sequence, samples in _read_row(connection, owner, (bundle, number)):
-                    if asset in found:
-                        found[asset].append((sequence, samples))
-        for name, blocks in found.items():
+                    if asset in blocks_by_asset:
+                        blocks_by_asset[asset].append((sequence, samples))
+        for name, blocks in blocks_by_asset.items():
             yield name, sorted(block for block in blocks if block[0] >= first[name])
 
 
@@ -218,13 +220,13 @@ def _read_row(
     """Return the blocks of a row, each packed as `Block.pack` does, none if there is no such row any more."""
     query = sa.select(*_columns("contents", "samples")).where(_is_row(owner, *key))
     row = connection.execute(query.with_for_update() if lock else query).first()
-    found, at = list[tuple[str, int, bytes]](), 0
+    entries, at = list[tuple[str, int, bytes]](), 0
     contents, whole = ("[]", b"") if row is None else row
     for asset, sequence, size, regular in _read_contents(contents):
         stored = whole[at : at + size]
-        found.append((asset, sequence, restore_times(stored) if regular else stored))
+        entries.append((asset, sequence, restore_times(stored) if regular else stored))
         at += size
-    return found
+    return entries
 
 
 def write_bundles(connection: sa.Connection, owner: str, changes: BundleChanges) -> None:
@@ -256,10 +258,10 @@ def dissolve_rows_of_others(connection: sa.Connection, owner: str, assets: Colle
     """Dissolve the rows of other owners with blocks of these assets: `owner` follows them now."""
     theirs = sa.select(*_columns("bundle", "owner", "number", "contents")).where(tables.bundles.c.owner != owner)
     own = tables.bundles.c.bundle.in_({bundle_number(asset) for asset in assets})
-    found = [
+    others = [
         (of, (bundle, number))
         for bundle, of, number, contents in connection.execute(theirs.where(own))
         if any(asset in assets for asset, *_ in _read_contents(contents))
     ]
-    for of, key in found:
+    for of, key in others:
         dissolve_row(connection, of, key)

@@ -93,11 +93,11 @@ def rows_to_columns(rows: Sequence[Row]) -> dict[str, list[Any]]:
 
 
 def _flatten_row(row: Mapping[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    flat: dict[str, Any] = {}
     for name, value in row.items():
         if name == "residual":
             for f, real, imaginary, healthy in value:
-                found |= {f"gamma_{f:g}Hz_real": real, f"gamma_{f:g}Hz_imag": imaginary, f"healthy_{f:g}Hz": healthy}
+                flat |= {f"gamma_{f:g}Hz_real": real, f"gamma_{f:g}Hz_imag": imaginary, f"healthy_{f:g}Hz": healthy}
         else:
-            found[name] = json.dumps(value) if isinstance(value, dict | list) else value
-    return found
+            flat[name] = json.dumps(value) if isinstance(value, dict | list) else value
+    return flat

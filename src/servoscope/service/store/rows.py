@@ -48,8 +48,8 @@ class CommandOutcome(NamedTuple):
 
 def fault_rows(t: float, kind: str, faults: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return the rows of faults as a diagnosis names them, found at `t` [UTC s]."""
-    found = ((fault["name"], fault["ratio"], *fault["interval"], 1.0) for fault in faults)
-    return [_size_row(t, kind, *values) for values in found]
+    sizes = ((fault["name"], fault["ratio"], *fault["interval"], 1.0) for fault in faults)
+    return [_size_row(t, kind, *values) for values in sizes]
 
 
 def coefficient_rows(t: float, parameters: Iterable[tuple[str, float, float, float]]) -> list[dict[str, Any]]:

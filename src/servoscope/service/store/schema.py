@@ -15,12 +15,12 @@ from servoscope.service.store.tables import METADATA, bundles, diagnoses, meta, 
 def _fill_sizes(connection: sa.Connection) -> None:
     """Make the table of a store of version 1, and fill it with what its full diagnoses have found."""
     sizes.create(connection)
-    found: dict[tuple[Any, ...], Row] = {}
+    size_rows: dict[tuple[Any, ...], Row] = {}
     for row in connection.execute(sa.select(diagnoses).where(diagnoses.c.grounds == "full")).mappings():
-        for one in fault_rows(row["t"], "full", row["document"].get("faults", [])):
-            found[row["asset"], row["t"], one["name"]] = {"asset": row["asset"], **one}
-    if found:
-        connection.execute(sizes.insert(), list(found.values()))
+        for version in fault_rows(row["t"], "full", row["document"].get("faults", [])):
+            size_rows[row["asset"], row["t"], version["name"]] = {"asset": row["asset"], **version}
+    if size_rows:
+        connection.execute(sizes.insert(), list(size_rows.values()))
 
 
 def _add_bundles(connection: sa.Connection) -> None:
@@ -58,18 +58,18 @@ def create_or_migrate(connection: sa.Connection, name: str, *, write: bool) -> i
         METADATA.create_all(connection)
         connection.execute(meta.insert(), [{"key": "schema", "value": schema_version()}])
         return schema_version()
-    found, newest = connection.execute(sa.select(meta.c.value).where(meta.c.key == "schema")).scalar(), schema_version()
-    if not isinstance(found, int) or found < FIRST_VERSION:
+    fault, newest = connection.execute(sa.select(meta.c.value).where(meta.c.key == "schema")).scalar(), schema_version()
+    if not isinstance(fault, int) or fault < FIRST_VERSION:
         raise StoreError(f"{name}: does not say of which version its tables are, restore it from a copy")
-    where = f"{name}: its tables are of version {found}"
-    if found > newest:
+    where = f"{name}: its tables are of version {fault}"
+    if fault > newest:
         raise StoreError(f"{where}, this servoscope knows up to {newest}: install a newer one")
-    if found < newest:
+    if fault < newest:
         if not write:
-            if found >= READABLE_FROM:
-                return found
+            if fault >= READABLE_FROM:
+                return fault
             raise StoreError(f"{where}, servoscope run brings them to {newest}")
-        for step in MIGRATIONS[found - FIRST_VERSION :]:
+        for step in MIGRATIONS[fault - FIRST_VERSION :]:
             step(connection)
         connection.execute(meta.update().where(meta.c.key == "schema").values(value=newest))
     elif missing := set(METADATA.tables) - present:

@@ -84,10 +84,10 @@ def read_series(
         query = query.where(table.c.name == name)
     if chosen := tuple(kinds):
         query = query.where(table.c.kind.in_(chosen))
-    found: dict[tuple[str, str], list[tuple[float, ...]]] = {}
-    for kind, each, *numbers in store.fetch_tuples(query.order_by(table.c.t)):
-        found.setdefault((kind, each), []).append(tuple(numbers))
-    return {key: np.array(rows, dtype=np.float64).T for key, rows in found.items()}
+    numbers_by_series: dict[tuple[str, str], list[tuple[float, ...]]] = {}
+    for kind, series_name, *numbers in store.fetch_tuples(query.order_by(table.c.t)):
+        numbers_by_series.setdefault((kind, series_name), []).append(tuple(numbers))
+    return {key: np.array(rows, dtype=np.float64).T for key, rows in numbers_by_series.items()}
 
 
 def read_notes(store: Store, asset: str) -> list[Row]:
@@ -142,8 +142,8 @@ def query_sizes(store: Store, asset: str, name: str | None = None, since: float 
     span = last_renewal(store, asset) if since is None else since, None
     # a year has five times as many rows; without one of that name, all names are needed for the error
     series = (name and read_series(store, asset, span, name=name)) or read_series(store, asset, span)
-    faults = sorted({each for kind, each in series if kind in FAULT_KINDS})
-    coefficients = sorted({each for kind, each in series if kind not in FAULT_KINDS})
+    faults = sorted({coefficient for kind, coefficient in series if kind in FAULT_KINDS})
+    coefficients = sorted({coefficient for kind, coefficient in series if kind not in FAULT_KINDS})
     if name is None and len(faults) > 1:
         raise StoreError(f"{asset}: several faults were named, say which: --value {' or '.join(faults)}")
     if name is None and not faults:

@@ -68,7 +68,7 @@ class Batch:
         write_bundles(connection, owner, self.bundles)
         for key, changes in ((tables.commands.c.id, self.outcomes), (tables.outbox.c.key, self.deliveries)):
             if changes:
-                rows = [{"of": each, **row} for each, row in changes.items()]
+                rows = [{"of": asset, **row} for asset, row in changes.items()]
                 connection.execute(key.table.update().where(key == sa.bindparam("of")), rows)
 
 

@@ -35,7 +35,7 @@ def check_block(
     """
     from servoscope.signals.quality.kernel import check_samples
 
-    t, r, u, y = (np.ascontiguousarray(each, dtype=np.float64) for each in (t, r, u, y))
+    t, r, u, y = (np.ascontiguousarray(signal, dtype=np.float64) for signal in (t, r, u, y))
     if t.ndim != 1 or not t.shape == r.shape == u.shape == y.shape:
         raise RecordingError("t, r, u and y of a block must have the same shape (N,)")
     new, findings = _copy_state(state), []
@@ -43,7 +43,7 @@ def check_block(
     while begin < len(t):
         begin = check_samples(limits, new.view(STATE_DTYPE), t, r, u, y, begin, out, count)
         rows = out[: count[0]].tolist()
-        findings += [QualityFinding(KINDS[int(kind)], bool(on), *rest) for kind, on, *rest in rows]
+        findings += [QualityFinding(KINDS[int(kind)], bool(on), *numbers) for kind, on, *numbers in rows]
     return new, tuple(findings)
 
 

@@ -52,10 +52,10 @@ class TableAddress:
         for name in (*self.equal, *([self.time] if self.time else ())):
             if name not in columns:
                 raise RecordingError(f"{self.text}: there is no column {name!r}, only {', '.join(columns)}")
-        found = self.time or next((name for name in TIME_COLUMNS if name in columns), None)
-        if found is None and (self.since or self.until):
+        column = self.time or next((name for name in TIME_COLUMNS if name in columns), None)
+        if column is None and (self.since or self.until):
             raise RecordingError(f"{self.text}: from and to need a time column, name it: time=COLUMN")
-        return found
+        return column
 
     def setting(self, suffix: str = "") -> tuple[str, str]:
         """Return name and value of the variable of the environment that belongs to the connection; empty: not set."""
@@ -71,19 +71,19 @@ class TableAddress:
     def moment(self, value: str) -> datetime:
         """Return a time as it stands in `from` and `to`, UTC unless it says otherwise; else RecordingError."""
         try:
-            found = datetime.fromisoformat(value)
+            moment = datetime.fromisoformat(value)
         except ValueError:
             example = "2026-01-31T12:00"
             raise RecordingError(f"{self.text}: {value!r} is no time, write from and to as {example}") from None
-        return found.replace(tzinfo=UTC) if found.tzinfo is None else found.astimezone(UTC)
+        return moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
 
     def table(self, columns: Sequence[str], read: Any) -> TableFile:
         """Return a table whose chunks `read` yields, as mappings of names to Arrow columns."""
 
         def chunks(wanted: Sequence[str], _: object) -> Any:
             first = 1
-            for found in read(tuple(wanted)):
-                table = Table(self.text, found, first)
+            for chunk in read(tuple(wanted)):
+                table = Table(self.text, chunk, first)
                 yield table
                 first += table.rows
 
@@ -108,10 +108,10 @@ def is_address(text: str | Path) -> bool:
 
 def _find_opener(text: str) -> EntryPoint | None:
     """Return what opens an address; a package cannot replace a built-in kind."""
-    scheme, colon, rest = text.partition(":")
-    if not (colon and rest and re.fullmatch(r"[a-z][a-z0-9]+", scheme)):
+    scheme, colon, place = text.partition(":")
+    if not (colon and place and re.fullmatch(r"[a-z][a-z0-9]+", scheme)):
         return None
-    return {each.name: each for each in (*entry_points(group=ENTRY_POINTS), *BUILT_IN)}.get(scheme)
+    return {opener.name: opener for opener in (*entry_points(group=ENTRY_POINTS), *BUILT_IN)}.get(scheme)
 
 
 def open_address(text: str, layout: TextLayout | None = None) -> TableFile | None:

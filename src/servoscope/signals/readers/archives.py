@@ -36,27 +36,27 @@ def expand_paths(paths: Sequence[Path], suffixes: Collection[str], what: str = "
 
     Raises RecordingError if a folder or an archive holds none, or a pattern meets none.
     """
-    found: list[Path] = []
+    expanded: list[Path] = []
     for path in paths:
         if is_address(path):
-            found.append(path)
+            expanded.append(path)
         elif path.is_dir():
-            files = sorted(each for each in path.iterdir() if each.is_file() and each.suffix.lower() in suffixes)
+            files = sorted(entry for entry in path.iterdir() if entry.is_file() and entry.suffix.lower() in suffixes)
             if not files:
                 raise RecordingError(f"{path}: holds no {what}; readable are {', '.join(suffixes)}")
-            found += expand_paths(files, suffixes, what)
+            expanded += expand_paths(files, suffixes, what)
         elif any(sign in str(path) for sign in "*?[") and not path.exists():
             root = Path(path.anchor) if path.is_absolute() else Path()
             files = sorted(root.glob(str(path.relative_to(root))))
             if not files:
                 raise RecordingError(f"{path}: no file has such a name, check the pattern")
-            found += expand_paths(files, suffixes, what)
+            expanded += expand_paths(files, suffixes, what)
         elif path.suffix.lower() == ZIP and path.is_file():
             members = list_members(path)
-            found += [path / member for member in members] if len(members) > 1 else [path]
+            expanded += [path / member for member in members] if len(members) > 1 else [path]
         else:
-            found.append(path)
-    return found
+            expanded.append(path)
+    return expanded
 
 
 def archive_of(path: Path) -> tuple[Path, str] | None:

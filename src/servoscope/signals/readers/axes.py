@@ -55,7 +55,7 @@ def find_axes(names: Sequence[str]) -> dict[str, list[str]]:
     shared = {blank for group in groups.values() for blank in group}
     shared = {blank for blank in shared if sum(blank in group for group in groups.values()) > 1}
     own = {mark: [group[blank] for blank in group if blank in shared] for mark, group in groups.items()}
-    marked = {name for each in own.values() for name in each}
+    marked = {name for marks in own.values() for name in marks}
     axes = {}
     for mark, mine in own.items():
         columns = [name for name in names if name in mine or name not in marked]

@@ -91,19 +91,19 @@ class ZoneOffset:
 
     def offsets(self, local: FloatArray) -> FloatArray:
         """Return the offset [s], shape (N,), at local times [s since 1970 as written], shape (N,), NaN at NaN."""
-        found = np.full(local.size, np.nan)
+        offsets = np.full(local.size, np.nan)
         known = np.flatnonzero(np.isfinite(local))
         if not known.size:
-            return found
+            return offsets
         times = local[known]
         steps, quarters = np.diff(times, prepend=self._last), np.floor(times / QUARTER_S)
-        each, where = np.unique(quarters, return_inverse=True)
-        first, second = np.array([self._both(quarter * QUARTER_S) for quarter in each.tolist()]).T
+        distinct, where = np.unique(quarters, return_inverse=True)
+        first, second = np.array([self._both(quarter * QUARTER_S) for quarter in distinct.tolist()]).T
         again = np.where(steps < -QUARTER_S, times + 3.0 * 3600.0, -np.inf)  # clocks go back by less than three hours
         again = np.maximum.accumulate(np.append(self._again, again))[1:]
-        found[known] = np.where(times < again, second[where], first[where])
+        offsets[known] = np.where(times < again, second[where], first[where])
         self._last, self._again = float(times[-1]), float(again[-1])
-        return found
+        return offsets
 
     def _both(self, local: float) -> tuple[float, float]:
         """Return the offsets [s] of a local time that comes once or twice."""
@@ -127,7 +127,7 @@ class ClockParser:
 
     def seconds(self, cells: Sequence[str | None]) -> FloatArray | int:
         """Return seconds since the first midnight, NaN for empty cells, shape (N,); else the index of a misfit."""
-        found = np.full(len(cells), np.nan)
+        elapsed = np.full(len(cells), np.nan)
         for index, cell in enumerate(cells):
             if cell is None or not cell.strip():
                 continue
@@ -139,8 +139,8 @@ class ClockParser:
                 if seconds < self._last - DAY_S / 2:
                     self._days += 1
                 self._last = seconds
-                found[index] = seconds + DAY_S * self._days
+                elapsed[index] = seconds + DAY_S * self._days
             else:
                 self._first = day if self._first is None else self._first
-                found[index] = seconds + DAY_S * (day - self._first)
-        return found
+                elapsed[index] = seconds + DAY_S * (day - self._first)
+        return elapsed

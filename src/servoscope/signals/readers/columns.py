@@ -101,7 +101,7 @@ def find_channel(name: str, known: Iterable[str], where: str) -> str:
     """
     known = list(known)
     name = _strip_backticks(name)
-    chosen = next((each for each in (name, *map(_strip_backticks, name.split("|"))) if each in known), None)
+    chosen = next((spelling for spelling in (name, *map(_strip_backticks, name.split("|"))) if spelling in known), None)
     if chosen is not None:
         return chosen
     defaults = Columns()

@@ -17,7 +17,7 @@ def open_concatenation(address: TableAddress) -> TableFile:
 
     Raises RecordingError if there are none, or one cannot be read; if a column that is used is not in all of them.
     """
-    paths = expand_paths([Path(each) for each in address.place.split(",")], readable_suffixes())
+    paths = expand_paths([Path(place) for place in address.place.split(",")], readable_suffixes())
     paths.sort(key=lambda path: [int(x) if x.isdecimal() else x for x in re.split(r"(\d+)", str(path))])
     files = [open_file(path, address.text_layout) for path in paths]
 

@@ -54,8 +54,8 @@ def open_csv(path: Path, text: TextLayout | None = None) -> TableFile:
     """Open a text file, once its layout is known; `text`: what the user says of it."""
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
-        while head.count(b"\n") < MIN_HEAD_LINES and len(head) < MAX_LINE_BYTES and (more := file.read(len(head))):
-            head += more
+        while head.count(b"\n") < MIN_HEAD_LINES and len(head) < MAX_LINE_BYTES and (chunk := file.read(len(head))):
+            head += chunk
         layout = detect_layout(path, head, text or TextLayout(), cut=bool(file.read(1)))
     return TableFile(path, layout.columns, lambda *wanted: read_csv(path, layout, *wanted))
 
@@ -87,12 +87,12 @@ def detect_layout(path: Path, head: bytes, text: TextLayout, cut: bool = False) 
     split = {delimiter: _split_lines(plain, delimiter, line_end) for delimiter in DELIMITERS if delimiter != line_end}
     if line_end == ";":  # it is the delimiter where it also stands between cells
         split |= {";": _split_lines(plain, ";", "")}
-    delimiter = max(split, key=lambda each: _score(split[each]))
+    delimiter = max(split, key=lambda candidate: _score(split[candidate]))
     rows = split[delimiter]
     table = find_table(rows, str(path), header)
     used = "" if delimiter == line_end else line_end
     if table is None:  # no row of numbers: the first line says what the columns are, and what follows is told later
-        delimiter = max(split, key=lambda each: len(next(filter(None, split[each]), [])))
+        delimiter = max(split, key=lambda candidate: len(next(filter(None, split[candidate]), [])))
         first, cells = next((i, row) for i, row in enumerate(split[delimiter]) if row)
         check_names(cells, str(path))
         named = tuple(cell or f"c{index}" for index, cell in enumerate(cells))
@@ -273,7 +273,7 @@ def _detect_encoding(head: bytes) -> str:
     except UnicodeDecodeError:
         # two bytes of Chinese are two letters of Latin: words that names of columns have tell
         told = lines.decode("gb18030", errors="replace")
-        words = (word for each in WORDS.values() for word in each if CHINESE_CHARACTER.search(word))
+        words = (word for synonyms in WORDS.values() for word in synonyms if CHINESE_CHARACTER.search(word))
         return "gb18030" if any(word in told for word in words) else "latin-1"
     return "utf-8-sig"
 

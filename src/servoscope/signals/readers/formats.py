@@ -57,8 +57,8 @@ class Reader(NamedTuple):
 
 _PACKAGE = "servoscope.signals.readers"
 BUILT_IN = {
-    suffix: Reader(format_, f"{_PACKAGE}.{module}", *rest)
-    for suffixes, format_, module, *rest in (
+    suffix: Reader(format_, f"{_PACKAGE}.{module}", *arguments)
+    for suffixes, format_, module, *arguments in (
         (".csv .txt .tsv .dat .asc .log", "CSV", "csv", "open_csv"),
         (".parquet .pq", "Parquet", "parquet", "open_parquet"),
         (".mat", "MAT", "mat", "open_mat"),
@@ -154,9 +154,9 @@ def _open_plain(path: Path, text: TextLayout | None) -> TableFile:
     else:  # looked up only now: it takes a hundredth of a second
         other = next((point for point in entry_points(group=ENTRY_POINTS) if f".{point.name.lower()}" == suffix), None)
         if other is None:
-            found = _recognise(head)
-            what = f", it looks like a {found}" if found else ""
-            if found == "bag of ROS 1":
+            kind = _recognise(head)
+            what = f", it looks like a {kind}" if kind else ""
+            if kind == "bag of ROS 1":
                 convert = f"rosbags-convert --src {path.name} --dst {path.stem} --dst-storage mcap"
                 raise RecordingError(f"{path}: is a bag of ROS 1, convert it: pip install rosbags, then {convert}")
             known = ", ".join(readable_suffixes())
@@ -171,23 +171,23 @@ def _open_plain(path: Path, text: TextLayout | None) -> TableFile:
 
 def _recognise(head: bytes) -> str | None:
     """Return what a file is by its first bytes; None for text."""
-    found = next((kind for magic, kind in MAGIC.items() if head.startswith(magic)), None)
-    if found is None and head[:256].lstrip(b"\xef\xbb\xbf \r\n\t").lower().startswith(
+    name = next((kind for magic, kind in MAGIC.items() if head.startswith(magic)), None)
+    if name is None and head[:256].lstrip(b"\xef\xbb\xbf \r\n\t").lower().startswith(
         (b"<!doctype", b"<html", b"<?xml", b"<svg")
     ):
         return "HTML or XML page"
-    if found is None and b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff")) and not is_utf16(head):
+    if name is None and b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff")) and not is_utf16(head):
         return "binary file"
-    return found
+    return name
 
 
 def _check_format(path: Path, head: bytes, wanted: str) -> None:
-    found = _recognise(head)
-    if found == wanted or (wanted, found) in COMPATIBLE_KINDS or (wanted in ("CSV", "JSON") and found in (None, "LVM")):
+    kind = _recognise(head)
+    if kind == wanted or (wanted, kind) in COMPATIBLE_KINDS or (wanted in ("CSV", "JSON") and kind in (None, "LVM")):
         return
-    suffix = next((suffix for suffix, reader in BUILT_IN.items() if reader.format == found), None)
+    suffix = next((suffix for suffix, reader in BUILT_IN.items() if reader.format == kind), None)
     advice = {
         "MDF file that its recorder never finished": "finalize it with the recorder's own tool",
         "gzip archive": f"rename it to {path.name}.gz",
-    }.get(found or "", f"rename it to {suffix}" if suffix else f"export it as {wanted}")
-    raise RecordingError(f"{path}: is not {wanted} but a {found or 'text file'}: {advice}")
+    }.get(kind or "", f"rename it to {suffix}" if suffix else f"export it as {wanted}")
+    raise RecordingError(f"{path}: is not {wanted} but a {kind or 'text file'}: {advice}")

@@ -113,6 +113,12 @@ SPEED_WORDS = {
     *("speed", "velocity", "rpm", "drehzahl", "istdrehzahl", "geschwindigkeit", "istgeschwindigkeit"),
     *("vitesse", "velocita", "velocidad", "速度", "转速"),
 }
+PRESSURE_WORDS = {"p", "pressure", "druck", "press", "pression", "pressione", "presion", "压力"}
+PRESSURE_SIDES = {
+    "A": {"a"},
+    "B": {"b"},
+    "supply": {"s", "supply", "pump", "system", "versorgung", "pumpe", "pompe", "pompa", "bomba"},
+}
 # parts of a message's stamp and counters, which are no signals whatever else their names say
 STAMP_WORDS = {"stamp", "timestamp", "sec", "nanosec", "nsec", "secs", "nsecs", "seq"}
 MEASURED_WORDS = {"actual", "act", "ist", "measured", "meas", "feedback", "fbk", "mesure", "misura", "reelle", "real"}
@@ -137,15 +143,15 @@ def guess_columns(names: Sequence[str]) -> dict[str, str]:
     has_reference = any(parts[name] & set(WORDS["r"]) and not parts[name] & set(COMMAND) for name in plain)
     heir = "u" if has_reference else "r"
     words = {**WORDS, heir: (*WORDS[heir][:2], *COMMAND, *WORDS[heir][2:])}
-    found: dict[str, str] = {}
+    guesses: dict[str, str] = {}
     if (pair := _named_alike(plain, parts)) is not None:
-        found["r"], found["y"] = pair
+        guesses["r"], guesses["y"] = pair
     for whole in (True, False):  # a name that is the word comes before one that only contains it
-        for letter in [word for word in words if word not in found]:
+        for letter in [word for word in words if word not in guesses]:
             among = {"t": values, "r": plain}.get(letter, signals)
             if letter == "y":
                 among = [name for name in signals if not ("output" in parts[name] and parts[name] & CONTROLLER_WORDS)]
-            left = [name for name in among if name not in found.values()]
+            left = [name for name in among if name not in guesses.values()]
             matches = (
                 name
                 for word in words[letter]
@@ -153,8 +159,8 @@ def guess_columns(names: Sequence[str]) -> dict[str, str]:
                 if (bare[name] == word if whole else word in parts[name])
             )
             if (match := next(matches, None)) is not None:
-                found[letter] = match
-    return {letter: found[letter] for letter in WORDS if letter in found}
+                guesses[letter] = match
+    return {letter: guesses[letter] for letter in WORDS if letter in guesses}
 
 
 def _named_alike(names: Sequence[str], parts: Mapping[str, set[str]]) -> tuple[str, str] | None:
@@ -164,21 +170,21 @@ def _named_alike(names: Sequence[str], parts: Mapping[str, set[str]]) -> tuple[s
     """
     ahead = set(WORDS["r"]) - {"r"}
     for measured in names:
-        if parts[measured] & MEASURED_WORDS and (rest := parts[measured] - MEASURED_WORDS):
+        if parts[measured] & MEASURED_WORDS and (stem := parts[measured] - MEASURED_WORDS):
             for name in names:
-                if parts[name] == rest and rest & set(WORDS["y"]) and _units_agree(measured, name):
+                if parts[name] == stem and stem & set(WORDS["y"]) and _units_agree(measured, name):
                     return name, measured
     for reference in names:
-        if parts[reference] & ahead and (rest := parts[reference] - ahead):
+        if parts[reference] & ahead and (stem := parts[reference] - ahead):
             for name in names:
-                if parts[name] == rest and _units_agree(reference, name):
+                if parts[name] == stem and _units_agree(reference, name):
                     return reference, name
     return None
 
 
-def _units_agree(one: str, other: str) -> bool:
+def _units_agree(name: str, other: str) -> bool:
     """Tell whether two names have the same unit, or one has none."""
-    units = {split_unit(one)[1], split_unit(other)[1]} - {""}
+    units = {split_unit(name)[1], split_unit(other)[1]} - {""}
     return len(units) < 2
 
 
@@ -192,7 +198,7 @@ def _words(name: str) -> set[str]:
     """Return the words of a name, its unit aside; of Chinese, all words that it contains."""
     bare = "".join(c for c in unicodedata.normalize("NFKD", split_unit(name)[0]) if not unicodedata.combining(c))
     latin = {part.casefold() for part in re.findall(r"[A-Z]?[a-zß]+|[A-Z]+(?![a-z])", bare)}
-    return latin | {word for each in WORDS.values() for word in each if not word.isascii() and word in name}
+    return latin | {word for synonyms in WORDS.values() for word in synonyms if not word.isascii() and word in name}
 
 
 def guess_mapping(names: Sequence[str]) -> dict[str, Any]:
@@ -212,6 +218,17 @@ def guess_mapping(names: Sequence[str]) -> dict[str, Any]:
         fields["time"] = " + ".join(clock)
     unit = "s" if len(clock) > 1 else TIME_UNITS.get(split_unit(columns.get("t", ""))[1], "s")
     return {**fields, "time_unit": unit, "segment": []}
+
+
+def guess_pressures(names: Sequence[str]) -> dict[str, str] | None:
+    """Return the columns of the pressures at a piston's sides A and B and of its supply; None without all three."""
+    parts = {name: _words(name) for name in names}
+    chosen = {
+        side: next((name for name in names if parts[name] & PRESSURE_WORDS and parts[name] & words), None)
+        for side, words in PRESSURE_SIDES.items()
+    }
+    columns = {side: scaled_channel(name) for side, name in chosen.items() if name is not None}
+    return columns if len({*columns.values()}) == len(PRESSURE_SIDES) else None
 
 
 def names_speed(channel: str) -> bool:
@@ -260,5 +277,5 @@ def quoted_channel(column: str) -> str:
 
 def _clock_columns(names: Sequence[str]) -> list[str]:
     """Return the columns that make one clock together: a date, a time of day, and its milliseconds."""
-    each = [next((name for name in names if _plain(name) in words), None) for words in CLOCK_PARTS]
-    return [name for name in each if name is not None] if each[1] and (each[0] or each[2]) else []
+    clock = [next((name for name in names if _plain(name) in words), None) for words in CLOCK_PARTS]
+    return [name for name in clock if name is not None] if clock[1] and (clock[0] or clock[2]) else []

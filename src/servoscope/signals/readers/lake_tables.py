@@ -36,10 +36,10 @@ def open_delta(address: TableAddress) -> TableFile:
                 bound = _scalar(address, rows.schema.field(time).type, limit)
                 chosen &= ds.field(time) >= bound if after else ds.field(time) < bound
         try:
-            found = rows.to_table(columns=_with_time(wanted, time), filter=chosen)
+            arrow = rows.to_table(columns=_with_time(wanted, time), filter=chosen)
         except (pa.ArrowException, OSError) as error:
             raise _unreadable(address, "Delta", error) from None
-        yield _ordered(found, wanted, time)
+        yield _ordered(arrow, wanted, time)
 
     return address.table(rows.schema.names, read)
 
@@ -69,10 +69,10 @@ def open_iceberg(address: TableAddress) -> TableFile:
             if limit is not None and time is not None:
                 chosen = expressions.And(chosen, compare(time, _bound(address, table, time, limit)))
         try:
-            found = table.scan(row_filter=chosen, selected_fields=tuple(_with_time(wanted, time))).to_arrow()
+            arrow = table.scan(row_filter=chosen, selected_fields=tuple(_with_time(wanted, time))).to_arrow()
         except Exception as error:  # of several kinds
             raise _unreadable(address, "Iceberg", error) from None
-        yield _ordered(found, wanted, time)
+        yield _ordered(arrow, wanted, time)
 
     return address.table(names, read)
 

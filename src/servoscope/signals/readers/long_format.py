@@ -127,7 +127,7 @@ def _label_signals(
             continue
         joined = codes * len(told[1]) + told[0]
         kept, codes = np.unique(joined, return_inverse=True)
-        names = [f"{told[1][each % len(told[1])]}.{names[each // len(told[1])]}" for each in kept.tolist()]
+        names = [f"{told[1][pair % len(told[1])]}.{names[pair // len(told[1])]}" for pair in kept.tolist()]
     return codes, names
 
 

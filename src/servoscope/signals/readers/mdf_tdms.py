@@ -117,16 +117,16 @@ def open_tdms(path: Path) -> TableFile:
         return [_Raster(rows, places, units) for (rows, *_), places in rasters.items()]
 
     def read(file: Any, raster: _Raster, names: Sequence[str], first: int, rows: int) -> Mapping[str, Any]:
-        found: dict[str, Any] = {}
+        values: dict[str, Any] = {}
         for name in names:
             place = raster.places[name]
             if isinstance(place[0], str):
                 group, channel = place
-                found[name] = file[group][channel].read_data(offset=first, length=rows)
+                values[name] = file[group][channel].read_data(offset=first, length=rows)
             else:  # a clock that the file describes by its step and its beginning
                 step, begin = place
-                found[name] = begin + step * np.arange(first, first + rows)
-        return found
+                values[name] = begin + step * np.arange(first, first + rows)
+        return values
 
     @contextmanager
     def opened() -> Iterator[Any]:
@@ -192,12 +192,12 @@ def _open_measurement(
 
     try:
         with opened() as file:
-            found = [raster for raster in list_rasters(file) if raster.rows]
+            nonempty = [raster for raster in list_rasters(file) if raster.rows]
     except Exception as error:
         raise damaged(error) from None
-    rasters = [raster.named() for raster in found]
+    rasters = [raster.named() for raster in nonempty]
     names = dict.fromkeys(name for raster in rasters for name in raster.places)
-    aliases = {name: raster.label(name) for raster in found for name in raster.places if raster.label(name) != name}
+    aliases = {name: raster.label(name) for raster in nonempty for name in raster.places if raster.label(name) != name}
     if not names:
         raise RecordingError(f"{path}: holds no channels with values")
     groups = tuple(tuple(raster.places) for raster in rasters)
@@ -209,7 +209,7 @@ def _common_raster(path: Path, rasters: Sequence[_Raster], wanted: Sequence[str]
     for raster in rasters:
         if set(wanted) <= set(raster.places):
             return raster
-    best = max(rasters, key=lambda one: len(set(wanted) & set(one.places)))
+    best = max(rasters, key=lambda raster: len(set(wanted) & set(raster.places)))
     strange = next(name for name in wanted if name not in best.places)
     raise RecordingError(
         f"{path}: {strange!r} was not sampled together with {', '.join(n for n in wanted if n in best.places)}: "

@@ -66,9 +66,11 @@ def open_bounded(path: Path, kind: str, module: str, function: str, library: str
                 first += batch.num_rows
 
     weakref.finalize(read_chunks, folder.cleanup)
-    found = run("describe_file")
-    groups = tuple(tuple(each) for each in found["groups"])
-    return TableFile(path, tuple(found["columns"]), read_chunks, found["others"], groups, found["aliases"])
+    description = run("describe_file")
+    groups = tuple(tuple(group) for group in description["groups"])
+    return TableFile(
+        path, tuple(description["columns"]), read_chunks, description["others"], groups, description["aliases"]
+    )
 
 
 def describe_file(_: Progress, module: str, function: str, path: str, shown: str) -> dict[str, Any]:

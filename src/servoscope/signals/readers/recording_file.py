@@ -65,7 +65,7 @@ def list_channels(path: str | Path, text: TextLayout | None = None) -> list[Chan
 
 
 def _channel_info(name: str, types: list[str], ranges: list[tuple[float, float]]) -> ChannelInfo:
-    kind = next((each for each in ("string", "double") if each in types), types[0])  # what the whole column would be
+    kind = next((kind for kind in ("string", "double") if kind in types), types[0])  # what the whole column would be
     if not ranges or (kind == "string" and len(ranges) < len(types)):
         return ChannelInfo(name, kind, float("nan"), float("nan"))
     return ChannelInfo(name, kind, min(low for low, _ in ranges), max(high for _, high in ranges))
@@ -191,10 +191,12 @@ def _read_rows(
     sensors = columns.outputs if len(columns.outputs) > 1 else ()
     texts_by_key = {"reference": (columns.reference,), "input": (columns.input,), "output": columns.outputs}
     texts_by_key |= {f"covariates.{covariate}": (text,) for covariate, text in columns.covariates.items()}
-    carried = (*sensors, *columns.covariates)
+    of_plant = {} if loop is None else loop.plant.channels
+    carried = (*sensors, *columns.covariates, *of_plant)
+    labelled = {f"[columns] {key}": several for key, several in texts_by_key.items()}
+    labelled |= {f"[plant] {channel}": (text,) for channel, text in of_plant.items()}
     signals = {
-        f"[columns] {key}": [_parse_signal(opened, text, f"{name}: [columns] {key}") for text in several]
-        for key, several in texts_by_key.items()
+        key: [_parse_signal(opened, text, f"{name}: {key}") for text in several] for key, several in labelled.items()
     }
     unwrappers = {
         (name, period): Unwrapper(period)
@@ -223,13 +225,13 @@ def _read_rows(
         if apart is not None:
             cells = apart.read(table)
             rows = {format_cell(v): mask & (cells == v) for v in dict.fromkeys(cells[mask].tolist())}
-        each = {
+        evaluated = {
             what: [_evaluate_signal(table, combination, what, unwrappers) for combination in several]
             for what, several in signals.items()
         }
         values = [
             several[0] if len(several) == 1 else np.mean(several, axis=0)
-            for several in itertools.islice(each.values(), 3)
+            for several in itertools.islice(evaluated.values(), 3)
         ]
         if clock is not None:
             values.insert(0, clock.seconds(table))
@@ -238,8 +240,9 @@ def _read_rows(
             run = int(runs[-1])
             values.append(runs)
         if sensors:
-            values += each["[columns] output"]
-        values += [each[f"[columns] covariates.{covariate}"][0] for covariate in columns.covariates]
+            values += evaluated["[columns] output"]
+        values += [evaluated[f"[columns] covariates.{covariate}"][0] for covariate in columns.covariates]
+        values += [evaluated[f"[plant] {channel}"][0] for channel in of_plant]
         for value, mine in rows.items():
             if value not in parts:
                 parts[value] = LoggedRows(name if by is None else f"{name}[{by}={value}]", *options)
@@ -308,9 +311,9 @@ class LoggedRows:
         columns = [column.to_array() for column in self._columns]
         if not self._has_time:
             columns.insert(0, _uniform_time(self._rows, self._rate or 1.0))
-        each = dict(zip(self._channels, columns[len(columns) - len(self._channels) :], strict=True))
+        covariates = dict(zip(self._channels, columns[len(columns) - len(self._channels) :], strict=True))
         signals, runs = columns[:4], columns[4 : len(columns) - len(self._channels)]
-        return signals, runs[0] if runs else None, each
+        return signals, runs[0] if runs else None, covariates
 
     def samples(self) -> Samples:
         """Return the rows in the order of time, and resampled where that is asked for; nothing else is done to them.
@@ -327,26 +330,32 @@ class LoggedRows:
 
     def dated_recording(self, log: Log) -> Recording:
         """Return the rows cleaned; time stamps that are seconds since 1970 count from the first of them."""
-        (t, *signals), run, each = self.split_columns()
+        (t, *signals), run, covariates = self.split_columns()
         began = log.origin
         if not began and t.size and MIN_EPOCH_S < t[0] < MAX_EPOCH_S:
             began = float(np.floor(t[0]))
             t = t if t.flags.writeable else t.copy()
             for rows in outofcore.iter_chunks(0, t.size, t):
                 t[rows] -= began
-        recording = self._clean([t, *signals], run, each)
+        recording = self._clean([t, *signals], run, covariates)
         return replace(recording, began=began, zone="UTC" if log.is_utc else "") if began else recording
 
     def recording(self) -> Recording:
         """Return the rows cleaned."""
-        signals, run, each = self.split_columns()
-        return self._clean(signals, run, each)
+        signals, run, covariates = self.split_columns()
+        return self._clean(signals, run, covariates)
 
-    def _clean(self, signals: list[FloatArray], run: FloatArray | None, each: dict[str, FloatArray]) -> Recording:
+    def _clean(self, signals: list[FloatArray], run: FloatArray | None, covariates: dict[str, FloatArray]) -> Recording:
         t, r, u, y = signals
         limits = self._loop.input_limits if self._loop is not None else None
         notes = [self._note(*torn, t) for torn in self._broken]
-        options = {"sample_rate": self._rate, "run": run, "limits": limits, "labels": self._labels, "channels": each}
+        options = {
+            "sample_rate": self._rate,
+            "run": run,
+            "limits": limits,
+            "labels": self._labels,
+            "channels": covariates,
+        }
         recording = clean(t, r, u, y, name=self.name, target=self._target, **options)  # type: ignore[arg-type]
         if not self._has_time:
             text = message("defect.no_time", rate=recording.sample_rate)

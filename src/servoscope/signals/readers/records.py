@@ -31,13 +31,13 @@ def open_json(path: Path) -> TableFile:
             lines = file.readline().strip().endswith(b"}") and bool(file.readline().strip())
         if lines:
             return _open_frame(path, pj.read_json(path))
-        found = json.loads(path.read_bytes())
-        while isinstance(found, dict) and len(found) == 1:  # a name around the table
-            found = next(iter(found.values()))
-        if isinstance(found, dict):
-            found = {name: values for name, values in found.items() if isinstance(values, list)}
-            return _open_frame(path, pa.table(found))
-        return open_records(path, found)
+        content = json.loads(path.read_bytes())
+        while isinstance(content, dict) and len(content) == 1:  # a name around the table
+            content = next(iter(content.values()))
+        if isinstance(content, dict):
+            content = {name: values for name, values in content.items() if isinstance(values, list)}
+            return _open_frame(path, pa.table(content))
+        return open_records(path, content)
     except (pa.ArrowException, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise RecordingError(
             f"{path}: is no table in JSON ({shorten_error(error)}), write one record per line"
@@ -126,7 +126,7 @@ def open_sqlite(path: Path) -> TableFile:
         except sqlite3.Error as error:
             raise RecordingError(f"{path}: cannot be read ({shorten_error(error)}), export it again") from None
 
-    groups = tuple(tuple(name for name, (table, _) in places.items() if table == each) for each in tables)
+    groups = tuple(tuple(name for name, (table, _) in places.items() if table == label) for label in tables)
     return TableFile(path, tuple(places), read_chunks, channel_groups=groups)
 
 

@@ -27,7 +27,7 @@ def open_sql(address: TableAddress) -> TableFile:
     time = address.time_column([column.name for column in table.c])
 
     def read(wanted: Sequence[str]) -> Iterator[dict[str, Any]]:
-        query = sa.select(*(table.c[each] for each in wanted))
+        query = sa.select(*(table.c[name] for name in wanted))
         for column, value in address.equal.items():
             query = query.where(table.c[column] == _typed(address, table.c[column], value))
         if time is not None:
@@ -40,7 +40,7 @@ def open_sql(address: TableAddress) -> TableFile:
             rows = opened.execution_options(stream_results=True).execute(query)
             for part in rows.partitions(CHUNK_ROWS):
                 columns = zip(wanted, zip(*part, strict=True), strict=True)
-                yield {each: pa.chunked_array([pa.array(values)]) for each, values in columns}
+                yield {name: pa.chunked_array([pa.array(values)]) for name, values in columns}
 
     return address.table([column.name for column in table.c], read)
 

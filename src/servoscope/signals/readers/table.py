@@ -184,15 +184,15 @@ class TimeColumn:
         if not any(is_clock(cell) for cell in cells if cell):
             return number_column(table, name, "time") * TIME_UNITS[unit]
         self._has_zone = self._has_zone or any(ZONED.search(cell) for cell in cells[:1] if cell)
-        found = self._clocks[name].seconds(cells)
-        if isinstance(found, int):
+        seconds = self._clocks[name].seconds(cells)
+        if isinstance(seconds, int):
             raise RecordingError(
-                f"{table.name}: row {table.row_number(found)}, column {name!r}: {str(cells[found])[:40]!r} is neither a"
-                " date nor a time, correct it or leave the cell empty"
+                f"{table.name}: row {table.row_number(seconds)}, column {name!r}: "
+                f"{str(cells[seconds])[:40]!r} is neither a date nor a time, correct it or leave the cell empty"
             )
-        if self._begin is None and len(self.columns) == 1 and np.isfinite(found).any():
-            self._begin = float(found[np.isfinite(found)][0])
-        return found - (self._begin or 0.0)
+        if self._begin is None and len(self.columns) == 1 and np.isfinite(seconds).any():
+            self._begin = float(seconds[np.isfinite(seconds)][0])
+        return seconds - (self._begin or 0.0)
 
 
 def _parse_numbers(table: Table, name: str, cells: list[str | None]) -> FloatArray:

@@ -31,7 +31,9 @@ def open_mcap(path: Path) -> TableFile:
     try:
         with path.open("rb") as file:
             reader = make_reader(file, decoder_factories=[DecoderFactory()])
-            decoded = ((channel.topic, m.log_time, each) for _, channel, m, each in reader.iter_decoded_messages())
+            decoded = (
+                (channel.topic, m.log_time, message) for _, channel, m, message in reader.iter_decoded_messages()
+            )
             return _open_messages(path, decoded)
     except RecordingError:
         raise
@@ -92,11 +94,11 @@ def _message_fields(message: Any, prefix: str = "", depth: int = 0) -> Iterator[
         if isinstance(value, bool | int | float):
             yield f"{prefix}{name}", float(value)
         elif isinstance(value, list | tuple | np.ndarray) and len(value) <= MAX_ARRAY_LENGTH:
-            for index, each in enumerate(value):
-                if isinstance(each, bool | int | float | np.number):
-                    yield f"{prefix}{name}[{index}]", float(each)
+            for index, item in enumerate(value):
+                if isinstance(item, bool | int | float | np.number):
+                    yield f"{prefix}{name}[{index}]", float(item)
                 elif depth < 4:
-                    yield from _message_fields(each, f"{prefix}{name}[{index}].", depth + 1)
+                    yield from _message_fields(item, f"{prefix}{name}[{index}].", depth + 1)
         elif depth < 4 and not isinstance(value, str | bytes):
             yield from _message_fields(value, f"{prefix}{name}.", depth + 1)
 
@@ -108,9 +110,9 @@ def open_ulog(path: Path) -> TableFile:
     try:
         log = ULog(str(path))
         topics = {}
-        for each in log.data_list:
-            name = each.name + (f"/{each.multi_id}" if each.multi_id else "")
-            data = {field: np.asarray(x) for field, x in each.data.items() if np.asarray(x).dtype.kind in "fiub"}
+        for dataset in log.data_list:
+            name = dataset.name + (f"/{dataset.multi_id}" if dataset.multi_id else "")
+            data = {field: np.asarray(x) for field, x in dataset.data.items() if np.asarray(x).dtype.kind in "fiub"}
             topics[name] = {"time": 1e-6 * data.pop("timestamp"), **data}
     # it raises what reading beyond the end, or of a format that is none, raises
     except Exception as error:
@@ -135,7 +137,7 @@ def _open_topics(path: Path, topics: Topics) -> TableFile:
             raise RecordingError(
                 f"{path}: {', '.join(sorted(used))} were not sampled together: log them in one topic, or resample them"
             )
-        found = {label: full[columns[label][0]][columns[label][1]] for label in wanted}
-        yield Table(path.name, {label: pa.chunked_array([np.ascontiguousarray(x)]) for label, x in found.items()})
+        values = {label: full[columns[label][0]][columns[label][1]] for label in wanted}
+        yield Table(path.name, {label: pa.chunked_array([np.ascontiguousarray(x)]) for label, x in values.items()})
 
     return TableFile(path, tuple(columns), read_chunks, channel_groups=groups)

@@ -33,17 +33,17 @@ class Unwrapper:
             return self._found
         self._piece = table
         known = np.flatnonzero(np.isfinite(x))
-        found = x.copy()
+        unwrapped = x.copy()
         if known.size:
             if math.isnan(self._last):
                 self._last = float(x[known[0]])
                 self._offset = -self._period if self._last > SIGNED_WORD_SHARE * self._period else 0.0
             steps = np.diff(x[known], prepend=self._last)
             turns = self._offset - self._period * np.cumsum(np.round(steps / self._period))
-            found[known] += turns
+            unwrapped[known] += turns
             self._last, self._offset = float(x[known[-1]]), float(turns[-1])
-        self._found = found
-        return found
+        self._found = unwrapped
+        return unwrapped
 
 
 def find_wrap(x: FloatArray) -> float | None:

@@ -28,6 +28,7 @@ from servoscope.diagnosis import operating_points
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.diagnosis.motion_signature import signature_columns
 from servoscope.diagnosis.relearn import relearn
+from servoscope.diagnosis.result import Diagnosis
 from servoscope.estimation.frequency_response import ResponseRow, response_rows
 from servoscope.learning import inspection
 from servoscope.learning.proposal import init
@@ -123,8 +124,8 @@ def propose_file(progress: Progress, file: str, request: requests.ProposalReques
         {"section": line.section, "key": line.key, "value": line.value, "why": str(line.why), "doubtful": line.doubtful}
         for line in proposal.lines
     ]
-    found = _inspection_result(inspection.inspect(recording, proposal.loop), recording)
-    return {"toml": proposal.to_toml(), "lines": lines, **found}
+    inspected = _inspection_result(inspection.inspect(recording, proposal.loop), recording)
+    return {"toml": proposal.to_toml(), "lines": lines, **inspected}
 
 
 def _inspection_result(result: inspection.Inspection, recording: Recording) -> JsonObject:
@@ -166,10 +167,15 @@ def diagnose_file(
         "trace": _trace_columns(trace, plant.coefficient_units),
         "signature": signature_columns(recording, used.loop, diagnosis.onset_s[1] if diagnosis.onset_s else None),
     }
+    return _keep_diagnosis(Path(out), diagnosis, data, used.hash)
+
+
+def _keep_diagnosis(out: Path, diagnosis: Diagnosis, data: JsonObject, used: str) -> JsonObject:
+    """Write what pages show of a diagnosis, by the baseline of this hash; return what lists show of it."""
     text = json.dumps(plain_values.replace_nan(data), allow_nan=False)
-    (Path(out) / "data.json").write_text(text, encoding="utf-8")
+    (out / "data.json").write_text(text, encoding="utf-8")
     kept = {"verdict": diagnosis.verdict, "summary": str(diagnosis.summary), "recording": diagnosis.recording}
-    return {**kept, "hash": used.hash}
+    return {**kept, "hash": used}
 
 
 def _diagnose_arm(
@@ -186,10 +192,7 @@ def _diagnose_arm(
     write_arm_page(out / "report.html", diagnosis, exam, baseline)
     document, arm = diagnosis.model_dump(mode="json"), exam.picture(baseline, diagnosis)
     data = {"document": document, "words": {}, "units": ("", ""), "signals": None, "trace": None, "arm": arm}
-    text = json.dumps(plain_values.replace_nan(data), allow_nan=False)
-    (out / "data.json").write_text(text, encoding="utf-8")
-    kept = {"verdict": diagnosis.verdict, "summary": str(diagnosis.summary), "recording": diagnosis.recording}
-    return {**kept, "hash": baseline.hash}
+    return _keep_diagnosis(out, diagnosis, data, baseline.hash)
 
 
 def learn_baseline(

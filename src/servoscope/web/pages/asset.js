@@ -50,7 +50,7 @@ export async function show(main, { session, signal, linked, values, part: name, 
   const arm = section("The arm and its joints", "Filled by the probability that the joint has changed.", joints);
   const spans = Object.entries(SPANS).map(([words, seconds]) => h("button", { type: "button", class: "filter", "aria-pressed": "false", onclick: () => chosen(seconds) }, words));
   const lengths = Object.entries(SIGNALS).map(([words, seconds]) => h("button", { type: "button", class: "filter", "aria-pressed": String(seconds === 30), onclick: () => looked(seconds) }, words));
-  const baseline = asset.baseline && h("a", { href: `/design?baseline=${part(asset.baseline)}` }, "What this baseline can tell apart");
+  const baseline = asset.baseline && !isArm && h("a", { href: `/design?baseline=${part(asset.baseline)}` }, "What this baseline can tell apart");
 
   main.replaceChildren(
     h("div", { class: "head" }, h("h1", {}, name), h("span", { class: "note" }, about), h("span", { class: "gap" }), baseline, h("details", { class: "code" }, h("summary", {}, "On a phone"), h("img", { src: `/api/v1${path}/code.svg`, alt: translate("QR code of this page"), loading: "lazy" })), h("button", { type: "button", class: "screen", onclick: () => print() }, "Print")),

@@ -16,6 +16,7 @@ const PAGES = {
   "how-to/read-a-verdict#the-motion-signature": ["Motion signature"],
   "how-to/read-a-verdict#the-three-verdicts": ["Verdict", "Diagnoses", "Diagnoses of recordings"],
   "how-to/relearn": ["Baseline", "Baselines"],
+  "how-to/robot-arm#in-a-service": ["The arm and its joints"],
   "how-to/trend": ["How it grows"],
   "explanation/how-it-works#6-detection-and-isolation": ["Distance from healthy", "Inverse frequency response", "Inverse response over frequency", "Coefficients"],
 };

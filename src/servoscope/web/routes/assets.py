@@ -139,13 +139,13 @@ def get_sizes(context: ContextDep, asset: str, query: Annotated[SizeQuery, Query
     """Return how its faults, or its coefficients, have changed over a time."""
     find_asset(context, asset)
     kinds = FAULT_KINDS if query.of == "faults" else ("coefficient",)
-    found = read_series(context.store, asset, query.span, kinds) if context.store.has_sizes else {}
+    series = read_series(context.store, asset, query.span, kinds) if context.store.has_sizes else {}
     columns = ("t", "value", "low", "high", "healthy")
     curves = [
         sizes.SizeCurve.model_validate(
             {"kind": kind, "name": name, **dict(zip(columns, thin_columns(rows, query.points).tolist(), strict=True))}
         )
-        for (kind, name), rows in found.items()
+        for (kind, name), rows in series.items()
     ]
     return sizes.SizeHistory(asset=asset, curves=curves)
 
@@ -160,7 +160,11 @@ def list_notes(context: ContextDep, asset: str) -> sizes.NoteList:
 @router.post("/assets/{asset}/notes", status_code=201)
 def add_note(context: ContextDep, who: Operator, asset: str, request: NoteRequest) -> sizes.Note:
     """Note what was done to it."""
-    find_asset(context, asset)
+    _, status = find_asset(context, asset)
+    if request.kind != NOTE and status.metadata.plant == "arm":
+        raise HTTPException(
+            409, f"{asset}: an arm learns from logs, and not from what the store keeps: use servoscope learn"
+        )
     context.store.add_audit(who.user, asset, NOTE, request.model_dump())
     return sizes.Note(who=who.user, **request.model_dump())
 

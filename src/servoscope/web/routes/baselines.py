@@ -87,7 +87,7 @@ def _baseline_facts(baseline: AnyBaseline) -> responses.BaselineFacts:
         loop, points, units, sources = baseline.loop.carrier, tuple[str, ...](), None, list(baseline.sources)
     else:
         loop, points, units = baseline.loop, baseline.points, signal_units(baseline.loop.plant.units)
-        sources = [source for one in baseline.per_point for source in one.sources]
+        sources = [source for member in baseline.per_point for source in member.sources]
     return responses.BaselineFacts(
         loop=loop.name,
         hash=baseline.hash,

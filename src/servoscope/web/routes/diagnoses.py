@@ -146,7 +146,7 @@ def _upload_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
     path = context.storage.path(responses.UploadDiagnosis, record.id) / "data.json"
     data = json.loads(path.read_bytes())
     trace = data["trace"]
-    coefficients = {one["name"]: one["unit"] for one in trace["parameters"]} if trace is not None else {}
+    coefficients = {item["name"]: item["unit"] for item in trace["parameters"]} if trace is not None else {}
     y, u = data["units"]
     known = DiagnosisContext(words=data["words"], units=(y, u), coefficient_units=coefficients)
     return responses.DiagnosisDetail(

@@ -72,7 +72,7 @@ async def start_preview(
         return {"learning": id_, "judged": judged._asdict(), **result}
 
     sources = [path.parent / source.name for baseline in before.per_point for source in baseline.sources]
-    reads = [str(one) for one in (path, history_folder(path), *sources) if one.exists()]
+    reads = [str(place) for place in (path, history_folder(path), *sources) if place.exists()]
     arguments = str(path), str(file), request, point, who.user, str(out)
     discard = partial(context.storage.remove, "learnings", id_)
     return context.jobs.submit(

@@ -311,7 +311,9 @@ def alarm_rows(asset: str, alarms: Mapping[str, AlarmStatus]) -> list[AlarmRow]:
         AlarmRow(
             asset=asset,
             alarm=name,
-            commands=[each for each in COMMAND_NAMES if (alarm.state, LifecycleEvent(each)) in TRANSITION_TABLE],
+            commands=[
+                command for command in COMMAND_NAMES if (alarm.state, LifecycleEvent(command)) in TRANSITION_TABLE
+            ],
             **dict(alarm),
         )
         for name, alarm in alarms.items()
