@@ -1,6 +1,6 @@
 """Robot arms: measured and simulated changes, named by joint, in comparison with two simple detectors; speed.
 
-    python benchmarks/arms.py [--count N] [--data FOLDER] [--json]
+    python benchmarks/arms.py {measured,simulated,speed} [--count N] [--data FOLDER] [--json]
 
 UR10e: learned from six recordings of three days, judged on others without payload, to which Coulomb friction of one
 joint is added in the middle. Simulated: six joints under position control whose loop reacts to the change; each
@@ -21,12 +21,13 @@ import numpy as np
 from tables import Table, parse_with_data, parser, show
 
 from servoscope.baseline.arm import ArmBaseline
-from servoscope.diagnosis.arm import diagnose_arm
+from servoscope.diagnosis.arm import diagnose_arm, examine_arm
 from servoscope.diagnosis.result import Diagnosis
-from servoscope.estimation.arm_regression import ArmSignals, filter_arm_log
+from servoscope.estimation.arm_regression import ArmSignals, block_information, filter_arm_log
 from servoscope.learning.arm import learn_arm
 from servoscope.learning.arm_setup import calibrate_load
 from servoscope.models.arm.dynamics import torque_regressor
+from servoscope.models.arm.model import FRICTION
 from servoscope.models.arm.settings import ArmLoop
 from servoscope.models.arm.urdf import parse_urdf
 from servoscope.signals.readers.arm_log import ArmRecording, read_arm_log
@@ -55,6 +56,7 @@ INJECTED = HELD_OUT[5:]  # long enough, and all joints move
 LOADED = ("identification_data__ur-20_02_19_14harm50secLoad", "identification_data__ur-20_02_19_15harm50secLoad")
 MASS = 2.805  # kg
 PUSHED = "collision__ur-20_01_22-push_pose_1"
+TX40_FRICTION = ((8.05, 5.53, 1.97, 1.11, 1.86, 0.65), (7.14, 8.26, 6.34, 2.48, 3.03, 0.282))  # N m s; N m
 OBSERVER_GAIN = 10.0  # 1/s
 WINDOW_S = 5.0
 SIMULATED_S = 60.0
@@ -185,20 +187,21 @@ def ur10e(folder: Path) -> tuple[list[Table], dict[str, str]]:
                 torque = x.torque.copy()
                 torque[:, j] += growth * coulomb * np.tanh(v[:, j] / 0.01) * late
                 changed = replace(x, torque=torque)
-                diagnosis = diagnose_arm(baseline, changed)
+                diagnosis, examination = examine_arm(baseline, changed)
                 found += bool(diagnosis.intervals)
                 if named(diagnosis, "friction", joint):
                     right += 1
                     of_recording += holds(diagnosis, 1.0 + growth)
                 for k, detector in enumerate(simple):
-                    simple_right[k] += detector.judge(filter_arm_log(changed, baseline.model)) == (True, j)
+                    simple_right[k] += detector.judge(examination.signals) == (True, j)
             inside += of_recording
             best[growth] = (*best.get(growth, ()), of_recording)
             print(name, growth, of_recording, file=sys.stderr, flush=True)
         total = len(INJECTED) * len(arm.names)
         counts = of(found, total), of(right, total), of(inside, right), *(of(x, total) for x in simple_right)
         rows.append((f"Coulomb friction + {100.0 * growth:.0f} %", *counts))
-    values["ur10e.tenth"] = ", ".join(map(str, best[0.1]))
+        values[f"ur10e.named{100.0 * growth:.0f}"] = of(right, total)
+    values |= {f"ur10e.{100.0 * growth:.0f}": ", ".join(map(str, counts)) for growth, counts in best.items()}
     masses = []
     for calibrating, judged in (LOADED, LOADED[::-1]):
         gains = calibrate_load(baseline, record(calibrating), MASS)
@@ -255,8 +258,6 @@ def ur10e(folder: Path) -> tuple[list[Table], dict[str, str]]:
 
 def floor(baseline: ArmBaseline, recording: ArmRecording) -> np.ndarray:
     """Return the standard deviation of a change of each joint's Coulomb friction in the middle [%]."""
-    from servoscope.estimation.arm_regression import block_information
-
     s = filter_arm_log(recording, baseline.model)
     design = baseline.design(s)
     columns = np.concatenate([design, baseline.deviations(s, design)], axis=1)
@@ -272,8 +273,39 @@ def floor(baseline: ArmBaseline, recording: ArmRecording) -> np.ndarray:
     return np.array(found)
 
 
+def tx40(folder: Path) -> Table:
+    """Compare friction of a TX40 with the published table (TX40_config.yaml of figaroh-examples), joint by joint."""
+    urdf = (folder / "tx40_mdh_modified.urdf").read_text(encoding="utf-8")
+    arm = parse_urdf(urdf, "tx40.urdf")
+    gears = np.diag([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])
+    gears[5, 4] = 32.0
+    offsets = (0.0, -np.pi / 2, np.pi / 2, 0.0, 0.0, 0.0)
+    joints = {
+        name: {"position": f"q{j + 1}_raw", "torque": f"current{j + 1}_raw", "offset": offsets[j]}
+        for j, name in enumerate(arm.names)
+    }
+    # as the authors model it: friction without load and curve
+    table = {"kind": "arm", "urdf": "x", "sample_rate": 1000.0, "cutoff": 30.0, "sign_speed": 0.02, "joints": joints}
+    table |= {"load_friction": False, "curve_speed": 0.0, "gears": gears.tolist()}
+    loop = ArmLoop.from_dict(table, "arm.toml")
+    baseline = learn_arm(loop, urdf, [read_arm_log(folder / "tx40.parquet", loop, arm)])
+    rows = []
+    for j, name in enumerate(arm.names):
+        row = [name]
+        for what, published in zip(FRICTION, TX40_FRICTION, strict=False):
+            value, std = baseline.coefficient(f"{name}.{what}")
+            if what == "viscous_friction" and j > 3:  # the wrist's motor turns both
+                value += baseline.coefficient(f"motor1.{what}")[0]
+            away = 100.0 * (value / published[j] - 1.0)
+            row += [f"{value:.3g} ± {1.96 * std:.2g}", f"{published[j]:.3g}", f"{away:+.1f}"]
+        row.append("yes" if not any(x.startswith(f"{name}.") for x in baseline.undetermined) else "no")
+        rows.append(tuple(row))
+    heads = ("joint", "viscous", "published", "away [%]", "Coulomb", "published ", "away [%] ", "determined")
+    return Table("TX40: friction and the published table", "N m s and N m, with 95 % intervals.", heads, tuple(rows))
+
+
 def simulated(count: int) -> tuple[Table, dict[str, str]]:
-    """Judge simulated recordings, `count` of each kind of change and five times as many healthy ones."""
+    """Judge simulated recordings, `count` of each kind of change and twice as many healthy ones."""
     arm, urdf, loop = simulated_arm(), URDF.read_text(encoding="utf-8"), simulated_arm_loop()
 
     def record(seed: int, change: ArmChange | None = None) -> ArmRecording:
@@ -286,7 +318,7 @@ def simulated(count: int) -> tuple[Table, dict[str, str]]:
     rows = []
     totals = np.zeros(4, int)
     for index, kind in enumerate(("", *KINDS)):
-        n = 5 * count if not kind else count
+        n = count if kind else 2 * count
         sums = np.zeros(6, int)  # found, named, sizes, onsets, simple detectors
         for k in range(n):
             rng = np.random.default_rng([index, k])
@@ -295,8 +327,7 @@ def simulated(count: int) -> tuple[Table, dict[str, str]]:
                 (low, high), choice = KINDS[kind]
                 size, joint = rng.uniform(low, high), int(rng.choice(choice))
                 change = ArmChange(kind, size, joint, SIMULATED_S * rng.uniform(1.0 / 3.0, 2.0 / 3.0))
-            recording = record(1000 * (index + 1) + k, change)
-            diagnosis = diagnose_arm(baseline, recording)
+            diagnosis, examination = examine_arm(baseline, record(1000 * (index + 1) + k, change))
             sums[0] += bool(diagnosis.intervals)
             if change is not None and named(diagnosis, kind, arm.names[change.joint - 1]):
                 sums[1] += 1
@@ -306,7 +337,7 @@ def simulated(count: int) -> tuple[Table, dict[str, str]]:
             elif change is not None:
                 print(change, diagnosis.summary, file=sys.stderr)
             for i, detector in enumerate(simple):
-                found, where = detector.judge(filter_arm_log(recording, baseline.model))
+                found, where = detector.judge(examination.signals)
                 sums[4 + i] += found and (change is None or kind == "payload" or where == change.joint - 1)
         print(kind or "none", sums, file=sys.stderr, flush=True)
         changed = (of(sums[1], n), of(sums[2], sums[1]), of(sums[3], sums[1])) if kind else ("", "", "")
@@ -367,11 +398,14 @@ def main() -> None:
     """Print the tables."""
     command = parser(__doc__)
     command.add_argument("--count", type=int, default=8, help="simulated recordings of each change")
+    command.add_argument("part", choices=("measured", "simulated", "speed"))
     given = parse_with_data(command, "real/ur10e")
-    tables, values = ur10e(given.data / "real" / "ur10e")
-    for table, more in (simulated(given.count), speed()):
-        tables.append(table)
-        values |= more
+    if given.part == "measured":
+        tables, values = ur10e(given.data / "real" / "ur10e")
+        tables.append(tx40(given.data / "real" / "tx40"))
+    else:
+        table, values = simulated(given.count) if given.part == "simulated" else speed()
+        tables = [table]
     show(tables, given.json, values)
 
 

@@ -135,11 +135,23 @@ def test_motor_angles_become_joint_angles() -> None:
 
 
 ROBOTS = {  # what robots log: positions, torques or currents, and what else looks like them
-    "UR": ("actual_q_{0}", "actual_current_{0}", ("target_q_{0}", "target_current_{0}", "actual_qd_{0}")),
+    "UR": (
+        "actual_q_{0}",
+        "actual_current_{0}",
+        ("target_q_{0}", "target_current_{0}", "actual_qd_{0}", "target_moment_{0}"),
+    ),
     "KUKA": ("AIPos.A{1}", "MACur.A{1}", ("ASPos_target.A{1}",)),
-    "Franka": ("q[{0}]", "tau_J[{0}]", ("dq[{0}]", "q_d[{0}]", "dtau_J[{0}]")),
+    "Franka": ("q[{0}]", "tau_J[{0}]", ("dq[{0}]", "q_d[{0}]", "dtau_J[{0}]", "tau_J_d[{0}]", "dq_d[{0}]")),
     "ROS 2": ("position[{0}]", "effort[{0}]", ("velocity[{0}]",)),
     "by name": ("{2}/pos", "{2}/torque", ("{2}/vel",)),
+}
+
+OPTIONAL = {  # velocity, target, target torque
+    "UR": ("actual_qd_{0}", "target_q_{0}", "target_moment_{0}"),
+    "KUKA": (None, "ASPos_target.A{1}", None),
+    "Franka": ("dq[{0}]", "q_d[{0}]", "tau_J_d[{0}]"),
+    "ROS 2": ("velocity[{0}]", None, None),
+    "by name": ("{2}/vel", None, None),
 }
 
 
@@ -162,6 +174,9 @@ def test_a_loop_file_is_proposed_from_what_robots_log(robot: str, tmp_path: Path
     assert [joint.torque.strip("`") for joint in loop.joints.values()] == [
         torque.format(j, j + 1, name) for j, name in enumerate(loop.joints)
     ]
+    elbow = loop.joints[simulated_arm().names[2]]
+    optional = [column and column.strip("`") for column in (elbow.velocity, elbow.target, elbow.target_torque)]
+    assert optional == [column and column.format(2, 3, "elbow") for column in OPTIONAL[robot]]
     written = tmp_path / "arm.toml"
     written.write_text(loop.to_toml({}), encoding="utf-8")
     assert ArmLoop.load(written)[0] == loop

@@ -110,7 +110,7 @@ def test_the_page_of_the_cylinder(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["own-log", "motor-axis", "fleet"])
+@pytest.mark.parametrize("name", ["own-log", "motor-axis", "fleet", "robot-arm"])
 def test_a_notebook_runs(name: str, tmp_path: Path) -> None:
     import nbformat
     from nbclient import NotebookClient

@@ -191,3 +191,38 @@ def test_a_constant_says_what_it_bounds() -> None:
 def test_constants_that_bound_are_told_from_vague_ones() -> None:
     names = constants_of(ast.parse("FEW = 1\nMOST_ROWS, MAX_ROWS = 1, 2\nSETTLED: int = 3\nSETTLED_SHARE = x = 4"))
     assert [name for name in names if is_vague(name)] == ["FEW", "MOST_ROWS", "SETTLED"]
+
+
+# Words that say nothing of a local, and the packages in which none is left.
+VAGUE_LOCALS = {"one", "found", "each", "rest", "more"}
+NAMED_PACKAGES = {
+    "assessment", "cli", "core", "design", "fleet", "prognosis", "report", "research", "scoring", "signals",
+}  # fmt: skip
+
+
+def locals_of(tree: ast.AST) -> Iterator[tuple[str, int]]:
+    """Yield the names that functions, lambdas and comprehensions bind, each with its line."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            yield from (
+                (argument.arg, argument.lineno) for argument in ast.walk(node.args) if isinstance(argument, ast.arg)
+            )
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.comprehension):
+            names = (name for name in ast.walk(node) if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store))
+            yield from ((name.id, name.lineno) for name in names)
+
+
+def test_locals_say_what_they_are() -> None:
+    vague = {
+        f"{source.path.as_posix()}:{line}: {name}"
+        for source in SOURCES
+        if source.path.parts[0] in NAMED_PACKAGES
+        for name, line in locals_of(source.tree)
+        if name in VAGUE_LOCALS
+    }
+    assert not vague, f"name what it is, a recording, a fault:{listing(sorted(vague))}"
+
+
+def test_vague_locals_are_found() -> None:
+    tree = ast.parse("def f(each):\n    found = [one for one in each]\n    return lambda more: more\nrest = 1")
+    assert {name for name, _ in locals_of(tree)} == {"each", "found", "one", "more"}

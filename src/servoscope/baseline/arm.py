@@ -33,7 +33,7 @@ PAYLOAD = ("m", "mx", "my", "mz")
 PAYLOAD_SIZES = (2.0, 0.5, 0.5, 0.5)
 # of friction and payload a priori, per chance of another change: work alters these, repair and damage the others
 SERVICE_ODDS = 10.0
-FRICTION_SIZE, LOAD_SIZE, TORQUE_SIZE, GAIN_SIZE, ENCODER_SIZE, RIPPLE_SIZE = 0.5, 0.1, 0.3, 0.2, 0.05, 0.1
+FRICTION_SIZE, LOAD_SIZE, TORQUE_SIZE, GAIN_SIZE, ENCODER_SIZE, RIPPLE_SIZE = 0.3, 0.1, 0.3, 0.2, 0.05, 0.1
 
 
 class ArmCause(NamedTuple):
@@ -248,7 +248,8 @@ def complete_columns(model: ArmModel, signals: ArmSignals, theta: FloatArray, te
         np.zeros_like(signals.q),
         dict(zip(model.names, range(len(model.names)), strict=True)),
     )
-    load = np.abs(model.inertial_torque(signals.q, still, still, theta[: len(model.base.names)]))
+    motion = (signals.v, signals.a) if model.loop.curve_speed else (still, still)  # as in models that are published
+    load = np.abs(model.inertial_torque(signals.q, *motion, theta[: len(model.base.names)]))
     own = [{what: signals.columns[:, at[f"{name}.{what}"]] for what in FRICTION[:2]} for name in model.arm.names]
     more = [own[j]["coulomb_friction"] * load[j] for j in range(n)]
     for j, joint in enumerate(model.loop.columns_of(model.arm)):

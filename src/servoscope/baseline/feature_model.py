@@ -207,8 +207,8 @@ class GroupStatistic(NamedTuple):
         X = np.hstack([np.ones((n, 1)), order if drift else order[:, :0], c - middle])
         gram = np.linalg.pinv(X.T @ X)
         B = gram @ X.T @ Z
-        rest, dof = Z - X @ B, max(n - float(X.shape[1]), 1.0)
-        left = rest.T @ rest / dof
+        residual, dof = Z - X @ B, max(n - float(X.shape[1]), 1.0)
+        left = residual.T @ residual / dof
         # recordings of one window say nothing of the shape: no feature then goes with another
         shape = within if np.trace(within) > 0.0 else np.eye(len(centre))
         ratio = float(np.trace(left) / np.trace(shape))
@@ -289,7 +289,7 @@ def fit_groups(
 ) -> tuple[FeatureGroup, ...]:
     """Return the groups of features of healthy recordings, each given by its windows, spans and covariates."""
     means = np.array([SpanFeatures.of(windows, layout).values for windows in recordings])
-    found = []
+    groups = []
     for level in range(layout.levels):
         rows = [np.array([w.features for w in windows if w.level == level]) for windows in recordings]
         if not all(len(row) for row in rows):
@@ -312,10 +312,10 @@ def fit_groups(
                 windows=len(apart) / len(M),
                 covariates=covariates,
             )
-            found.append(group)
+            groups.append(group)
             if (past := _own_past(group, spans)) is not None:
-                found.append(past)
-    return tuple(found)
+                groups.append(past)
+    return tuple(groups)
 
 
 def _own_past(group: FeatureGroup, spans: Sequence[Sequence[SpanFeatures]]) -> FeatureGroup | None:
@@ -324,8 +324,8 @@ def _own_past(group: FeatureGroup, spans: Sequence[Sequence[SpanFeatures]]) -> F
     picked = [[past.pick(span) for span in span_features if span.shift.size] for span_features in spans]
     if not all(picked):
         return None
-    means = np.array([np.mean([values for values, _ in each], axis=0) for each in picked])
-    worth = float(np.mean([sum(count for _, count in each) for each in picked]))
+    means = np.array([np.mean([values for values, _ in windows], axis=0) for windows in picked])
+    worth = float(np.mean([sum(count for _, count in windows) for windows in picked]))
     if not np.isfinite(means).all() or not worth > 0.0:
         return None
     return past.model_copy(update={"means": to_tuples(means), "windows": worth})

@@ -69,7 +69,7 @@ class SpanSums:
     def mean(self) -> SpanFeatures:
         """Return the means; NaN where nothing was seen."""
         with np.errstate(invalid="ignore", divide="ignore"):
-            values, motion = (one[0] / one[1] for one in (self._values, self._motion))
+            values, motion = (sums[0] / sums[1] for sums in (self._values, self._motion))
             if not len(self._early):
                 return SpanFeatures(values, self.counts.copy(), motion)
             (sums, seen), number = self._early[:, :, 1:], self._early[0, :, 0]

@@ -100,12 +100,12 @@ def learn_sensors(loop: Loop, recordings: Sequence[Recording]) -> SensorModel | 
     Raises NotEnoughError if the recordings are too short.
     """
     names = loop.columns.outputs
-    values = [found for rec in recordings if (found := sensor_values(rec, names)) is not None]
+    values = [signals for rec in recordings if (signals := sensor_values(rec, names)) is not None]
     if not values:
         return None
     size = max(2, round(loop.sample_rate / loop.monitor.evaluation_rate))
     parts = [_blocks(x, size) for x in values]
-    blocks = _Blocks(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+    blocks = _Blocks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
     if len(blocks.median) < MIN_BLOCKS:
         raise NotEnoughError(
             f"{recordings[0].name}: {len(blocks.median)} blocks of {size} samples are too few to compare "
@@ -172,9 +172,9 @@ def _classify(
     """Say what is wrong with sensor i, from what all blocks after the onset have in common."""
     two = len(model.names) == 2
     median = blocks.median[after]
-    each = blocks.difference[after] - np.array(model.offset) - np.array(model.slope) * median[:, None]
+    differences = blocks.difference[after] - np.array(model.offset) - np.array(model.slope) * median[:, None]
     # the median of three is the larger of two, where one is far off: sizes are against the mean of the others
-    e = each[:, i] if two else each[:, i] - np.delete(each, i, axis=1).mean(axis=1)
+    e = differences[:, i] if two else differences[:, i] - np.delete(differences, i, axis=1).mean(axis=1)
     offset, total = float(e.mean()), float(e @ e)
     gain = float(e @ median / (median @ median)) if median.any() else 0.0
     of_offset, of_gain = float(((e - offset) ** 2).sum()), float(((e - gain * median) ** 2).sum())

@@ -49,12 +49,13 @@ def threshold(
     from scipy import special  # not scipy.stats: half a second to import
 
     dof = min(max(dof, n + 2.0), 1e9)
-    rest = dof - n + 1.0
+    remaining_dof = dof - n + 1.0
     limit = 10.0
     for _ in range(20):
         looks = counted * SECONDS_PER_YEAR * min(evaluation_rate, max(limit / (2.0 * memory), 1.0 / memory))
         tail = min(false_alarms_per_year / looks, 0.5)
-        share = float(special.betaincinv(rest / 2.0, n / 2.0, tail))  # upper quantile of F(n, rest) through the beta's
+        # upper quantile of F(n, remaining_dof) through the beta's
+        share = float(special.betaincinv(remaining_dof / 2.0, n / 2.0, tail))
         limit = dof * (1.0 - share) / share
     return limit
 

@@ -17,10 +17,11 @@ from servoscope.baseline.arm import ArmCause
 from servoscope.core.arrays import FloatArray
 from servoscope.estimation.arm_regression import Information
 
-MIN_END_BLOCKS = 3  # blocks of a recording that a change has to last
+MIN_END_BLOCKS = 1  # blocks of a recording that a change has to last
 INTERVAL = 1.96  # standard deviations, on both sides
 EM_STEPS = 25  # of expectation and maximisation, after which the variances have settled
 SIMULATED_RECORDINGS = 1000  # healthy ones, from which the limit comes
+CONFIDENCE = 0.9  # that a variance between few recordings is not larger
 PRIOR_COUNT = 3.0  # recordings that the prior of a variance counts for
 BETWEEN_SHARE, DRIFT_SHARE = 0.1, 0.02  # prior of recordings and halves, as a share of the size of a change
 
@@ -74,7 +75,7 @@ class ChangeTest:
     def weigh(self) -> ChangeEvidence:
         """Return the evidence of the recording itself."""
         r, drifted = self._change_vector(self._information.g[None])
-        found = []
+        evidences = []
         for cause, term, log_prior in zip(self._causes, self._terms, self._log_prior, strict=True):
             sizes = term.sizes(r)[0]
             logs = term.log_factors(r)[0] + drifted[0]
@@ -84,13 +85,13 @@ class ChangeTest:
             off = sizes - size
             covariance = np.einsum("k,kij->ij", onset, term.covariance) + np.einsum("k,ki,kj->ij", onset, off, off)
             log_factor = total - float(np.logaddexp.reduce(drifted[0])) + float(log_prior)
-            found.append(CauseEvidence(cause, log_factor, onset, size, covariance))
-        logs = np.array([evidence.log_factor for evidence in found])
+            evidences.append(CauseEvidence(cause, log_factor, onset, size, covariance))
+        logs = np.array([evidence.log_factor for evidence in evidences])
         order = np.argsort(-logs)
         total = float(np.logaddexp.reduce(logs))
         probability = np.exp(logs[order] - total)
         t = self._information.t[:-1]
-        return ChangeEvidence(t, total, tuple(found[i] for i in order), probability)
+        return ChangeEvidence(t, total, tuple(evidences[i] for i in order), probability)
 
     def healthy_limit(self, share: float) -> float:
         """Return what the logarithm of the Bayes factor of any change exceeds in a share of healthy recordings.
@@ -103,7 +104,7 @@ class ChangeTest:
         g = np.einsum("kij,skj->ski", vectors, noise)
         root = np.linalg.cholesky(np.linalg.inv(self._prior))
         effect = np.broadcast_to((rng.normal(size=(SIMULATED_RECORDINGS, len(root))) @ root.T)[:, None], g.shape).copy()
-        onset = rng.integers(len(A), size=SIMULATED_RECORDINGS)
+        onset = rng.integers(len(self._gain), size=SIMULATED_RECORDINGS)
         drift = rng.normal(size=(SIMULATED_RECORDINGS, self._drift.size)) * self._drift
         late = np.arange(len(A)) >= onset[:, None]
         effect[:, :, len(root) - self._drift.size :] += late[..., None] * drift[:, None]
@@ -158,16 +159,20 @@ def second_half(information: Information, prior: FloatArray) -> tuple[FloatArray
 
 
 def random_effect(parts: Sequence[tuple[FloatArray, FloatArray]], scale: FloatArray, share: float) -> FloatArray:
-    """Return the standard deviation (D,) of deviations, one per part, by expectation and maximisation.
+    """Return the upper confidence limit of the standard deviation (D,) of deviations, one per part.
+
+    By expectation and maximisation.
 
     `parts`: information (D, D) and vector (D,) of each; `share`: of `scale` (D,), which a variance has a priori.
     """
-    start = (share * scale) ** 2
+    from scipy.stats import chi2
+
+    start, freedom = (share * scale) ** 2, PRIOR_COUNT + len(parts)
     variance = start.copy()
     for _ in range(EM_STEPS):
         total = PRIOR_COUNT * start
         for A, g in parts:
             covariance = np.linalg.inv(A + np.diag(1.0 / variance))
             total = total + (covariance @ g) ** 2 + np.diag(covariance)
-        variance = total / (PRIOR_COUNT + len(parts))
-    return np.sqrt(variance)
+        variance = total / freedom
+    return np.asarray(np.sqrt(variance * freedom / chi2.ppf(1.0 - CONFIDENCE, freedom)))

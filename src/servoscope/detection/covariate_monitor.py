@@ -35,10 +35,10 @@ def read_channels(
     """Return the covariates of a block, NaN where there is no number; raise RecordingError where one is missing."""
     if (missing := next((name for name in names if name not in channels), None)) is not None:
         raise RecordingError(str(message("covariate.missing", covariate=missing)))
-    found = {name: np.asarray(channels[name], dtype=np.float64) for name in names}
-    if any(channel.shape != shape for channel in found.values()):
+    covariates = {name: np.asarray(channels[name], dtype=np.float64) for name in names}
+    if any(channel.shape != shape for channel in covariates.values()):
         raise RecordingError("covariates must have the shape of r")
-    return {name: np.where(np.isfinite(channel), channel, np.nan) for name, channel in found.items()}
+    return {name: np.where(np.isfinite(channel), channel, np.nan) for name, channel in covariates.items()}
 
 
 class CovariateMonitor:
@@ -69,9 +69,9 @@ class CovariateMonitor:
         Once, as soon as all are known, the coefficients (n,) to start from come too. An average is NaN before the first
         value, and where the newest value is too old.
         """
-        found = read_channels(self.model.names, channels, signals[0].shape)
+        covariates = read_channels(self.model.names, channels, signals[0].shape)
         of_average, age = np.split(state, [self.average.size])
-        began, values = not np.isnan(of_average).any(), self.model.values(found)
+        began, values = not np.isnan(of_average).any(), self.model.values(covariates)
         averages = self.average.run(of_average, values)
         averages[self._ages(age, values) > self.hold] = np.nan
         known = np.flatnonzero(~np.isnan(averages).any(axis=1))
@@ -110,25 +110,25 @@ class CovariateMonitor:
         averages, std = np.split(averages, [len(self.model.names)], axis=1)
         known = np.isfinite(averages).all(axis=1) & self.model.is_inside(averages)
         c = np.where(known[:, None], self.model.clip(averages), self.model.origin)
-        theta, more = self.model.theta(self._theta, c), self.model.theta_covariance(self._theta, c)
+        theta, spread = self.model.theta(self._theta, c), self.model.theta_covariance(self._theta, c)
         if std.size:
             off = self.model.theta(self._theta, c + np.where(known[:, None], std, 0.0)) - theta
-            more = more + off[:, :, None] * off[:, None, :]
-        return theta - self._theta, more, known
+            spread = spread + off[:, :, None] * off[:, None, :]
+        return theta - self._theta, spread, known
 
     def compare(self, trace: Trace, averages: FloatArray) -> Trace:
         """Return evaluations compared with what is healthy at averages of the covariates, as `expect` takes them.
 
         Where these are not known, or outside of what was learned, none is ready.
         """
-        moved, more, known = self.expect(averages)
-        expected, C, healthy = trace.expected + moved, trace.covariance + more, trace.ifrf_expected
+        moved, spread, known = self.expect(averages)
+        expected, C, healthy = trace.expected + moved, trace.covariance + spread, trace.ifrf_expected
         ready = trace.ready & known
         return replace(
             trace,
             expected=expected,
             covariance=C,
-            ifrf_expected=frequency_response(self._bank, healthy.frequencies, expected, self._covariance + more),
+            ifrf_expected=frequency_response(self._bank, healthy.frequencies, expected, self._covariance + spread),
             statistic=np.where(ready, t2_statistic(trace.theta, expected, C), 0.0),
             ready=ready,
         )

@@ -79,7 +79,7 @@ def choose_cusum_hypotheses(
     if len(whitened.phi) < MIN_UPDATES:
         return ()
     size = np.sqrt((whitened.phi**2).mean(axis=0))
-    found = []
+    hypotheses = []
     for fault in plant.faults:
         for bound in np.log(fault.ratio_range):
             for x in whitened.sizes(fault.parameter, float(bound)):
@@ -88,10 +88,10 @@ def choose_cusum_hypotheses(
                 except SimulationError:
                     continue
                 change = np.linalg.lstsq(whitened.phi / size, d, rcond=None)[0] / size
-                found.append(CusumHypothesis(fault.parameter, float(np.exp(x)), tuple(change.tolist()), 0.0, 0.0))
-    if found and expectation.pipeline.loop.monitor.sequential_step == "evaluation":
-        found = whitened.combine(found)
-    return whitened.worst_case(found, covariance)
+                hypotheses.append(CusumHypothesis(fault.parameter, float(np.exp(x)), tuple(change.tolist()), 0.0, 0.0))
+    if hypotheses and expectation.pipeline.loop.monitor.sequential_step == "evaluation":
+        hypotheses = whitened.combine(hypotheses)
+    return whitened.worst_case(hypotheses, covariance)
 
 
 def worst_case_hypotheses(
@@ -177,7 +177,7 @@ class _WhitenedResidual:
             return tuple(chosen)
         names = self.plant.physical_parameters[: len(covariance)]
         drift = np.array([self.shift(parameter, STEP) / STEP for parameter in names])
-        found = []
+        combined = []
         for member in chosen:
             d = self.phi @ np.array(member.change)
             # information of the updates that a step takes together
@@ -187,8 +187,8 @@ class _WhitenedResidual:
             false = self.rate / self.together * float(steps.mean()) * SECONDS_PER_YEAR
             q = drift @ d / max(float(d @ d), 1e-300)
             worst = max(member.rate, false), max(member.drift, float(q @ covariance @ q))
-            found.append(replace(member, rate=worst[0], drift=worst[1]))
-        return tuple(found)
+            combined.append(replace(member, rate=worst[0], drift=worst[1]))
+        return tuple(combined)
 
 
 def _fairest_directions(unit: FloatArray, count: int) -> tuple[FloatArray, float]:

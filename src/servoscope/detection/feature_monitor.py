@@ -66,7 +66,7 @@ class FeatureMonitor:
 
         `channels`: the covariates at the samples of the block, NaN where one has no value.
         """
-        sums, scores, found = self._span(state), state[: self.model.in_a_row], []
+        sums, scores, scored = self._span(state), state[: self.model.in_a_row], []
         values = np.array([channels[name] for name in self.model.covariates], dtype=np.float64)
         begin = 0
         for end, ended in groupby(windows, key=lambda window: window.end):
@@ -85,18 +85,18 @@ class FeatureMonitor:
             if np.isfinite(ratio):  # what is unfamiliar neither raises nor clears
                 scores[:-1] = scores[1:].copy()
                 scores[-1] = ratio
-            found.append(SpanScore(end, ratio, self.value(state), span))
+            scored.append(SpanScore(end, ratio, self.value(state), span))
         if values.size:
             self._add_covariates(state, values[:, begin:])
             state[self.model.in_a_row] += values.shape[1]
-        return found
+        return scored
 
     def _add_covariates(self, state: FloatArray, values: FloatArray) -> None:
         """Add values (k, N), one after the other, whatever the blocks: pairwise sums would differ in the last bit."""
         sums = state[self.model.in_a_row + 1 : self._sums].reshape(2, -1)
         known = np.isfinite(values)
-        for total, more in zip(sums, (np.where(known, values, 0.0), known.astype(np.float64)), strict=True):
-            total[:] = np.cumsum(np.column_stack([total, more]), axis=1)[:, -1]
+        for total, addend in zip(sums, (np.where(known, values, 0.0), known.astype(np.float64)), strict=True):
+            total[:] = np.cumsum(np.column_stack([total, addend]), axis=1)[:, -1]
 
     def _mean(self, state: FloatArray) -> SpanFeatures:
         """Return the features of the span that runs; a covariate without any value is NaN, which nothing is like."""
@@ -165,7 +165,9 @@ class FeatureLanes:
         `channels`: covariates, of the same shape each, where one depends on any.
         """
         before, spans = self.values(rows), []
-        ended = {asset: [*each] for asset, each in groupby(self._windows.run(rows, r, u, y, restart), itemgetter(0))}
+        ended = {
+            asset: [*windows] for asset, windows in groupby(self._windows.run(rows, r, u, y, restart), itemgetter(0))
+        }
         for asset, feature_monitor in enumerate(self._assets):
             if feature_monitor is None or not (asset in ended or feature_monitor.model.covariates):
                 continue

@@ -62,7 +62,7 @@ def calibrate_thresholds(
         T2 = np.where(
             ready, t2_statistic(e.theta, expected, np.where(ready[:, None, None], e.S, np.eye(len(tuning.theta)))), 0.0
         )
-        alarms = (apply_alarm_delays(each, *pipeline.delays) for each in (limit < T2, e.level >= 1.0))
+        alarms = (apply_alarm_delays(exceeded, *pipeline.delays) for exceeded in (limit < T2, e.level >= 1.0))
         events += [int((np.diff(alarm.astype(np.int8)) == 1).sum()) for alarm in alarms]
     return CalibrationFactors(*(_share(float(event), counted * rehearsals) for event in events))
 

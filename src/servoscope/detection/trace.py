@@ -40,8 +40,11 @@ def detection_statistics(
     silent from `UNSEEN_EXCESS` on.
     """
     known = ready if motion is None else ready & (motion < UNSEEN_EXCESS)
-    found = Statistic("t2", t2, limit, ready & (t2 > limit)), Statistic("cusum", cusum, 1.0, known & (cusum >= 1.0))
-    return found if features is None else (*found, Statistic("features", features, 1.0, features > 1.0))
+    statistics = (
+        Statistic("t2", t2, limit, ready & (t2 > limit)),
+        Statistic("cusum", cusum, 1.0, known & (cusum >= 1.0)),
+    )
+    return statistics if features is None else (*statistics, Statistic("features", features, 1.0, features > 1.0))
 
 
 def any_exceeded(statistics: tuple[Statistic, ...]) -> BoolArray:

@@ -118,7 +118,7 @@ class WarmUpMonitor(CovariateMonitor):
         products = (g.phi[:, :, None] * g.phi[:, None, :]).reshape(len(r), -1)
         used = np.column_stack([products, g.phi * g.eta[:, None]])
         columns = np.column_stack([np.where(g.ok[:, None], used, 0.0), np.where(lossy, loss, 0.0), lossy])
-        found, k = np.full((len(r), 2), np.nan), 0
+        course, k = np.full((len(r), 2), np.nan), 0
         gaps = [*np.flatnonzero(restart).tolist(), len(r)]
         while k < len(r):
             if restart[k]:
@@ -131,13 +131,13 @@ class WarmUpMonitor(CovariateMonitor):
             if parts.P[0, 0] < MAX_KNOWN_STD**2:
                 if np.isnan(parts.average).any():
                     start = self.model.theta(self._theta, self.model.clip(parts.x[:1]))
-                found[rows, 0] = self.average.run(parts.average, np.full((end - k, 1), parts.x[0]))[:, 0]
-                found[rows, 1] = np.sqrt(parts.P[0, 0])
+                course[rows, 0] = self.average.run(parts.average, np.full((end - k, 1), parts.x[0]))[:, 0]
+                course[rows, 1] = np.sqrt(parts.P[0, 0])
             parts.head[0] += end - k
             if parts.head[0] >= self._block:
                 self._end_block(parts)
             parts.head[1], k = y[end - 1], end
-        return found, start
+        return course, start
 
     def _end_block(self, parts: Any) -> None:
         """Take what a block measures, see whether a jump explains the last ones, and go on to the next one."""

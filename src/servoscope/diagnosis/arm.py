@@ -14,8 +14,8 @@ from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import RecordingError
 from servoscope.core.messages import Message, message
-from servoscope.detection.arm_events import ArmEvent, find_events, outside_events, outside_torque
-from servoscope.detection.arm_evidence import INTERVAL, CauseEvidence, ChangeEvidence, ChangeTest
+from servoscope.detection.arm_events import ArmEvent, find_events, outside_events, outside_torque, target_jumps
+from servoscope.detection.arm_evidence import INTERVAL, MIN_END_BLOCKS, CauseEvidence, ChangeEvidence, ChangeTest
 from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, FaultInterval, FinalCoefficient, Verdict
 from servoscope.estimation.arm_regression import (
     MIN_MOVING_S,
@@ -35,6 +35,11 @@ MIN_RIVAL_PROBABILITY = 0.05  # of a cause that the headline of an open answer l
 MAX_FACTOR = 20.0  # power of ten up to which evidence is written
 YEAR_S = 365.25 * 86400.0  # in which one healthy window may be called changed
 ONSET_TAIL = 0.025  # probability on either side of an onset's interval
+ONSET_STEP_S = 0.2  # to which an onset is found: the filters leave no more
+MAX_ONSET_STEPS = 60  # of an onset's interval, longer ones where that is long
+Rows = tuple[
+    FloatArray, FloatArray, FloatArray
+]  # times, weighted columns and residuals, as `block_information` has them
 UNITS = {"offset": "N m", "counterbalance": "N m", "gear ripple": "N m", "encoder offset": "rad"}
 
 
@@ -104,15 +109,15 @@ def examine_arm(baseline: ArmBaseline, recording: ArmRecording) -> tuple[Diagnos
     signals = filter_arm_log(recording, model)
     design, theta = baseline.design(signals), np.array(baseline.theta)
     residual = signals.tau - np.einsum("jpm,p->jm", design, theta)
-    outside = outside_torque(signals, design, residual, model, theta)
+    outside = outside_torque(signals, design, residual, noise, model, theta)
     events = find_events(signals.t, outside, np.array(baseline.event_limits) * noise, model.arm.names)
     columns = np.concatenate([design, baseline.deviations(signals, design)], axis=1)
-    moved, information, evidence = _weigh(baseline, signals, columns, residual, events)
+    moved, rows, information, evidence = _weigh(baseline, signals, columns, residual, events)
     if events and evidence is not None and evidence.log_factor > baseline.limit:
         # what differs without them is a change, of which they are the peaks
         events = []
-        moved, information, evidence = _weigh(baseline, signals, columns, residual, events)
-    warnings = [*_event_warnings(events), *_still_warnings(model.arm.names, moved, recording)]
+        moved, rows, information, evidence = _weigh(baseline, signals, columns, residual, events)
+    warnings = [*_event_warnings(events, recording), *_still_warnings(model.arm.names, moved, recording)]
     if evidence is None or information is None:
         headline = message("arm.undetermined_pushed" if events else "arm.undetermined")
         return _result(recording, "undetermined", headline, warnings), ArmExamination(signals, outside, None, events)
@@ -122,7 +127,7 @@ def examine_arm(baseline: ArmBaseline, recording: ArmRecording) -> tuple[Diagnos
         smallest = _smallest_changes(baseline, information, moved)
         headline = message("arm.healthy_pushed" if events else "arm.healthy", smallest=smallest)
         return _result(recording, "healthy", headline, warnings, parameters), examination
-    verdict, headline, interval, reasons = _explain(baseline, evidence)
+    verdict, headline, interval, reasons = _explain(baseline, evidence, rows)
     if interval.faults and interval.faults[0].mass_kg is not None and baseline.loop.gains == "data sheet":
         warnings.append(_warning("relative", recording.t[0], recording.t[-1], message("arm.relative_mass")))
     checks = tuple(message(f"arm.check.{kind.replace(' ', '_')}") for kind in _named_kinds(interval))
@@ -137,16 +142,21 @@ def _weigh(
     columns: FloatArray,
     residual: FloatArray,
     events: list[ArmEvent],
-) -> tuple[BoolArray, Information | None, ChangeEvidence | None]:
-    """Return which joints moved (n,) outside of events, and the evidence of that; None where none did."""
+) -> tuple[BoolArray, Rows, Information | None, ChangeEvidence | None]:
+    """Return which joints moved (n,) outside of events, the weighted rows, and what they say; None where none did."""
     clear = outside_events(signals.t, events)
     moved = (signals.moving & clear).sum(1) * float(np.median(np.diff(signals.t))) >= MIN_MOVING_S
-    if not moved.any():
-        return moved, None, None
     w = signals.moving * clear / (np.array(baseline.noise) * np.sqrt(baseline.inflation))[:, None]
-    information = block_information(signals.t, columns * w[:, None], residual * w)
+    rows = signals.t, columns * w[:, None], residual * w
+    if not moved.any():
+        return moved, rows, None, None
+    information = block_information(*rows)
+    return moved, rows, information, _change_test(baseline, information).weigh()
+
+
+def _change_test(baseline: ArmBaseline, information: Information, causes: Sequence[ArmCause] = ()) -> ChangeTest:
     scale, drift = np.array(baseline.scale), np.array(baseline.drift)
-    return moved, information, ChangeTest(information, baseline.random_effect, baseline.causes, scale, drift).weigh()
+    return ChangeTest(information, baseline.random_effect, causes or baseline.causes, scale, drift)
 
 
 def _result(
@@ -172,9 +182,10 @@ def _warning(kind: str, from_s: float, to_s: float, text: Message) -> DiagnosisW
     return DiagnosisWarning(kind=kind, from_s=float(from_s), to_s=float(to_s), count=1, description=text)
 
 
-def _event_warnings(events: Sequence[ArmEvent]) -> Iterator[DiagnosisWarning]:
-    for event in events:
-        text = message("arm.event", joints=event.joints, torque=event.torque, joint=event.joints[0])
+def _event_warnings(events: Sequence[ArmEvent], recording: ArmRecording) -> Iterator[DiagnosisWarning]:
+    for event, jump in zip(events, target_jumps(recording.t, recording.target, events), strict=True):
+        kind = "arm.event_trajectory" if jump else "arm.event"
+        text = message(kind, joints=event.joints, torque=event.torque, joint=event.joints[0])
         yield _warning("event", event.from_s, event.to_s, text)
 
 
@@ -219,7 +230,7 @@ def _smallest_changes(baseline: ArmBaseline, information: Information, moved: Bo
 
 
 def _explain(
-    baseline: ArmBaseline, evidence: ChangeEvidence
+    baseline: ArmBaseline, evidence: ChangeEvidence, rows: Rows
 ) -> tuple[Verdict, Message, FaultInterval, tuple[Message, ...]]:
     """Return verdict, headline, interval and reasons of a change."""
     named = [index for index, cause in enumerate(evidence.causes) if cause.cause.kind != UNKNOWN]
@@ -234,14 +245,13 @@ def _explain(
         groups[cause_evidence.cause.kind, cause_evidence.cause.joint].append(index)
     odds = {key: float(evidence.probability[indices].sum()) for key, indices in groups.items()}
     ranked = sorted(odds, key=lambda key: -odds[key])
-    best = evidence.causes[groups[ranked[0]][0]]
-    onset, from_start = _onset(evidence, best)
+    best = _pool(evidence, groups[ranked[0]])
+    onset, from_start = _onset(baseline, evidence, best, rows)
     since = message("diagnosis.since_start") if from_start else message("diagnosis.since", t=onset[1], growth=None)
     candidates = []
     for key in ranked:
         if odds[key] >= MIN_PROBABILITY:
-            likeliest = evidence.causes[groups[key][0]]
-            fault = _fault(baseline, likeliest)
+            fault = _fault(baseline, likeliest := _pool(evidence, groups[key]))
             faults = () if fault is None else (fault,)
             candidates.append(Candidate(name=likeliest.cause.name, probability=odds[key], faults=faults))
     certain = odds[ranked[0]] >= MIN_CERTAINTY and best.cause.kind != UNKNOWN
@@ -273,6 +283,19 @@ def _explain(
     return "fault", message("arm.ambiguous", rivals=rivals, since=since, told=told), interval, reasons
 
 
+def _pool(evidence: ChangeEvidence, indices: Sequence[int]) -> CauseEvidence:
+    """Return the likeliest of causes of one kind, its first size averaged over those that have it by probability."""
+    likeliest = evidence.causes[indices[0]]
+    same = [index for index in indices if evidence.causes[index].cause.parameter == likeliest.cause.parameter]
+    share = evidence.probability[same] / evidence.probability[same].sum()
+    sizes = np.array([evidence.causes[index].size[0] for index in same])
+    variances = np.array([evidence.causes[index].covariance[0, 0] for index in same])
+    size, covariance = likeliest.size.copy(), likeliest.covariance.copy()
+    size[0] = share @ sizes
+    covariance[0, 0] = share @ (variances + (sizes - size[0]) ** 2)
+    return likeliest._replace(size=size, covariance=covariance)
+
+
 def _joint(name: str) -> Message | None:
     return message("arm.of_joint", joint=name) if name else None
 
@@ -287,15 +310,27 @@ def _named_kinds(interval: FaultInterval) -> list[str]:
     return list(dict.fromkeys(candidate.name.partition(" of ")[0] for candidate in likely))
 
 
-def _onset(evidence: ChangeEvidence, best: CauseEvidence) -> tuple[tuple[float, float, float], bool]:
+def _onset(
+    baseline: ArmBaseline, evidence: ChangeEvidence, best: CauseEvidence, rows: Rows
+) -> tuple[tuple[float, float, float], bool]:
     """Return lower end, likeliest, upper end of the onset's 95 % interval [s], and whether it may be older."""
-    below = best.onset.cumsum()
+    (first, likely, last), from_start = _onset_interval(evidence.t, best.onset)
+    if not from_start:  # again, in finer blocks
+        step = max(ONSET_STEP_S, (last - first) / MAX_ONSET_STEPS)
+        edges = np.arange(first, last + (MIN_END_BLOCKS + 1) * step, step)
+        fine = _change_test(baseline, block_information(*rows, edges=edges), [best.cause]).weigh()
+        (first, likely, last), _ = _onset_interval(fine.t, fine.causes[0].onset)
+    return (first, likely, last), from_start
+
+
+def _onset_interval(t: FloatArray, onset: FloatArray) -> tuple[tuple[float, float, float], bool]:
+    """Return lower end, likeliest, upper end of an onset [s] by its blocks, and whether it may be the start."""
+    below = onset.cumsum()
     ends = np.searchsorted(below, [ONSET_TAIL, 1.0 - ONSET_TAIL])
     low, high = (min(int(end), below.size - 1) for end in ends)
-    likely = int(best.onset.argmax())
     # a change within a block: either this or the next is the first that is better explained with it
-    first, last = evidence.t[max(0, low - 1)], evidence.t[min(high + 1, evidence.t.size - 1)]
-    return (float(first), float(evidence.t[likely]), float(last)), low == 0
+    first, last = t[max(0, low - 1)], t[min(high + 1, t.size - 1)]
+    return (float(first), float(t[int(onset.argmax())]), float(last)), low == 0
 
 
 def _fault(baseline: ArmBaseline, found: CauseEvidence) -> FaultEstimate | None:
@@ -333,8 +368,11 @@ def _interval(baseline: ArmBaseline, found: CauseEvidence) -> tuple[float, float
         gradient[:2] = size[:2] / max(value, 1e-300)
         half = INTERVAL * float(np.sqrt(gradient @ found.covariance @ gradient))
     else:
-        value = float(size[0])
-        half = INTERVAL * float(np.sqrt(found.covariance[0, 0]))
+        value, std = float(size[0]), float(np.sqrt(found.covariance[0, 0]))
+        if found.cause.kind == "friction":  # it is a ratio to a healthy value, which differs between recordings
+            healthy = baseline.coefficient(f"{found.cause.joint}.{found.cause.parameter}")[0]
+            std = float(np.hypot(std, value * baseline.between[found.cause.columns[0]] / healthy))
+        half = INTERVAL * std
     return value, value - half, value + half
 
 

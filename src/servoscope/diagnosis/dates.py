@@ -22,8 +22,8 @@ def date_timeline(headline: Message, began: float) -> Message:
         return message(DATED[given.key], began=began, **times)
 
     stretches = tuple(
-        one.model_copy(update={"values": {**one.values, "when": dated(one.values["when"])}})
-        for one in headline.values["stretches"]
+        stretch.model_copy(update={"values": {**stretch.values, "when": dated(stretch.values["when"])}})
+        for stretch in headline.values["stretches"]
     )
     now = headline.values["now"]
     values = {**headline.values, "stretches": stretches, "now": None if now is None else dated(now)}

@@ -70,15 +70,15 @@ class Monitor:
     ) -> None:
         self.fleet = not isinstance(baseline, Baseline | str | Path)
         several: Any = baseline if self.fleet else (baseline,)
-        self.baselines = tuple(Baseline.of(each) for each in several)
+        self.baselines = tuple(Baseline.of(source) for source in several)
         if not self.baselines:
             raise BaselineError("a monitor needs at least one baseline")
         distinct = {id(baseline): baseline for baseline in self.baselines}
-        for each in distinct.values():
-            if each.others:
+        for checked in distinct.values():
+            if checked.others:
                 raise BaselineError(
-                    f"a monitor follows one operating point, this baseline has {', '.join(each.points)}: give "
-                    f"baseline.at({each.points[0]!r})"
+                    f"a monitor follows one operating point, this baseline has {', '.join(checked.points)}: give "
+                    f"baseline.at({checked.points[0]!r})"
                 )
         if share_budget:
             shared = {key: baseline.shared(len(self.baselines)) for key, baseline in distinct.items()}
@@ -288,10 +288,10 @@ class Monitor:
                 )
             self._step = self._groups[0][1].stepper
         if self._prefix_size or self._size > self._side_at:  # arrays of one number take longer than the step itself
-            one, gap = np.array([r, u, y])[:, None, None], np.zeros((1, 1), dtype=np.bool_)
-            self._follow_sides(state[None, :], list(one), gap, {})
+            sample, gap = np.array([r, u, y])[:, None, None], np.zeros((1, 1), dtype=np.bool_)
+            self._follow_sides(state[None, :], list(sample), gap, {})
             if self._prefix_size:
-                u = float(self._apply_input_stages(state[None, :], one[0], one[1], one[2], gap)[0, 0])
+                u = float(self._apply_input_stages(state[None, :], sample[0], sample[1], sample[2], gap)[0, 0])
                 state = state[self._prefix_size :]
         return self._step(state, r, u, y)
 

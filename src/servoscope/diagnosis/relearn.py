@@ -95,8 +95,8 @@ def relearn(
         names = ", ".join(earlier.points) or "none"
         raise BaselineError(f"{path}: has no operating point {min(strange)!r}, choose from {names}")
     folders = [path.parent, history_folder(path), *folders]
-    folders += [Path(each).parent for some in given.values() for each in some if isinstance(each, str | Path)]
-    new = {point: [as_recording(each, loop) for each in some] for point, some in given.items()}
+    folders += [Path(source).parent for some in given.values() for source in some if isinstance(source, str | Path)]
+    new = {point: [as_recording(source, loop) for source in some] for point, some in given.items()}
     notes: dict[str, list[Message]] = {}
     reference = history.get(known.reference, earlier)
     for point, some in new.items():
@@ -105,12 +105,12 @@ def relearn(
             compare_with_earlier(reference, point, some, progress, accept_change or after is not None, "first")
     learned = {baseline.point: baseline for baseline in earlier.per_point if baseline.point in new}
     together = {point: list(new[point]) for point in learned}
-    for each in () if after in RENEWALS else learned.values():
-        kept, missing = find_sources(each, folders)
+    for previous in () if after in RENEWALS else learned.values():
+        kept, missing = find_sources(previous, folders)
         if missing and not leave_out:
             _refuse_missing(path, missing[0], folders)
-        together[each.point][:0] = kept
-        notes[each.point] += [message("learning.source_missing", recording=name) for name in missing]
+        together[previous.point][:0] = kept
+        notes[previous.point] += [message("learning.source_missing", recording=name) for name in missing]
     chosen = together.get("", together)
     baseline = learn(loop, chosen, progress, accept_delay=accept_delay, force=force, earlier=earlier)
     number = max(history) + 1
@@ -124,9 +124,9 @@ def relearn(
         parent=known.number,
         reference=number if changed or after in RENEWALS else known.reference,
     )
-    for each in baseline.per_point:
-        update = {"notes": (*each.notes, *notes.get(each.point, ())), "learned": learned[each.point].learned}
-        learned[each.point] = each.model_copy(update=update)
+    for member in baseline.per_point:
+        update = {"notes": (*member.notes, *notes.get(member.point, ())), "learned": learned[member.point].learned}
+        learned[member.point] = member.model_copy(update=update)
     points = [learned.get(baseline.point, baseline) for baseline in earlier.per_point]
     baseline = points[0].model_copy(update={"others": tuple(points[1:]), "revision": revision})
     if save:

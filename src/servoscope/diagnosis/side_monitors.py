@@ -53,7 +53,7 @@ class SideMonitors:
     @property
     def size(self) -> int:
         """Numbers of the state."""
-        return sum(each.size for each in (self.features, self.covariates, self.motion) if each is not None)
+        return sum(monitor.size for monitor in (self.features, self.covariates, self.motion) if monitor is not None)
 
     @property
     def is_joinable(self) -> bool:
@@ -70,12 +70,12 @@ class SideMonitors:
 
     def start(self) -> FloatArray:
         """Return the state before the first sample, shape (size,)."""
-        parts = [each.start() for each in (self.features, self.covariates, self.motion) if each is not None]
+        parts = [monitor.start() for monitor in (self.features, self.covariates, self.motion) if monitor is not None]
         return np.concatenate(parts) if parts else np.zeros(0)
 
     def _split(self, state: FloatArray) -> list[FloatArray]:
         """Return the slices of a state."""
-        sizes = [0 if each is None else each.size for each in (self.features, self.covariates, self.motion)]
+        sizes = [0 if monitor is None else monitor.size for monitor in (self.features, self.covariates, self.motion)]
         return np.split(state, np.cumsum(sizes)[:-1])
 
     def run(

@@ -83,6 +83,8 @@ def _filter_pieces(recording: ArmRecording, model: ArmModel) -> Iterator[ArmSign
                 continue
             q = sosfiltfilt(of_motion, recording.q[rows], axis=0)
             v = np.gradient(q, 1.0 / rate, axis=0)
+            if recording.velocity is not None:
+                v = sosfiltfilt(of_motion, recording.velocity[rows], axis=0)
             a = np.gradient(v, 1.0 / rate, axis=0)
             columns, mass = model.columns(q, v, a)
             moving = np.abs(v) > loop.rest_speed
@@ -120,18 +122,22 @@ class Information(NamedTuple):
 
 
 def block_information(
-    t: FloatArray, columns: FloatArray, residual: FloatArray, block_s: float = BLOCK_S
+    t: FloatArray,
+    columns: FloatArray,
+    residual: FloatArray,
+    block_s: float = BLOCK_S,
+    edges: FloatArray | None = None,
 ) -> Information:
     """Return the information of the blocks of a recording.
 
     `t`: (M,) [s]; `columns`: (n, D, M) and `residual`: (n, M), both over the residual's standard deviation, 0 where a
     sample has no weight, of which at least one must have some; `block_s`: length of a block [s], longer in long
-    recordings.
+    recordings; `edges`: where blocks begin instead, but for the first [s].
     """
     length = max(block_s, float(t[-1] - t[0]) / MAX_BLOCKS)
     used = columns.any((0, 1))
     t, columns, residual = t[used], columns[:, :, used], residual[:, used]
-    number = np.floor((t - t[0]) / length).astype(int)
+    number = np.floor((t - t[0]) / length).astype(int) if edges is None else np.searchsorted(edges, t, side="right")
     cuts = np.append(np.flatnonzero(np.diff(number, prepend=-1)), t.size)
     A, g = [], []
     for first, end in itertools.pairwise(cuts):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -36,8 +38,10 @@ from servoscope.estimation.arm_regression import (
     block_information,
     filter_arm_log,
 )
+from servoscope.learning.arm_setup import nominal_gains
 from servoscope.models.arm.model import FRICTION, ArmModel
 from servoscope.models.arm.settings import ArmLoop
+from servoscope.models.arm.urdf import Kinematics
 from servoscope.signals.readers.arm_log import ArmRecording
 
 FIT_STEPS = 3  # of least squares, each weighted by what the one before left of each joint's torque
@@ -48,6 +52,8 @@ MOUNTING_RATIO = 2.0  # by which another mounting has to explain more before the
 MAX_COEFFICIENT = 1e3  # standard deviation of friction and offset a priori [N m, N m s]: nothing is known
 MAX_LOAD_FRICTION = 0.05  # the same of friction by load [N m per N m], of which little is known where the load is small
 NO_LOAD_FRICTION = 1e-6  # the same where the loop file leaves it out
+MAX_GAIN_ERROR = 0.3  # share by which a gain may differ from that of the target torque
+MAX_VELOCITY_ERROR = 0.1  # share by which a logged velocity may differ from the derivative of the position
 MIN_RECORDINGS = 3  # from which recordings are judged by the others
 
 
@@ -77,9 +83,15 @@ def learn_arm(loop: ArmLoop, urdf: str, recordings: Sequence[ArmRecording]) -> A
 
     Raises NotEnoughError if a joint hardly moves in them, RecordingError if a sign is reversed.
     """
-    model = ArmModel(loop.kinematics(urdf, loop.urdf), loop)
+    arm = loop.kinematics(urdf, loop.urdf)
+    loop, recordings, notes = _choose_velocity(loop, arm, recordings)
+    model = ArmModel(arm, loop)
     signals = [filter_arm_log(recording, model) for recording in recordings]
     _check_motion(model, signals)
+    if recordings[0].target_torque is not None:
+        ratios = zip(arm.names, nominal_gains(model, recordings[0], signals[0]), strict=True)
+        off = [(joint, ratio) for joint, ratio in ratios if ratio and abs(ratio - 1.0) > MAX_GAIN_ERROR]
+        notes += [message("arm.target_gain", joint=joint, ratio=ratio) for joint, ratio in off]
     temperature = np.mean([signal.temperature.mean(0) for signal in signals], axis=0)
     theta = _start(model)
     for _ in range(2):  # friction by load needs the load, which the first fit gives
@@ -119,8 +131,41 @@ def learn_arm(loop: ArmLoop, urdf: str, recordings: Sequence[ArmRecording]) -> A
         event_limits=to_tuples(np.maximum(EVENT_MARGIN * events, least_event)),
         limit=max(0.0, *limits),
         undetermined=tuple(_undetermined(model, theta, std * np.sqrt(typical))),
-        notes=(*_mounting_notes(model, signals, designs, fit, recordings[0].name), *odd),
+        notes=(*notes, *_mounting_notes(model, signals, designs, fit, recordings[0].name), *odd),
     )
+
+
+def _choose_velocity(
+    loop: ArmLoop, arm: Kinematics, recordings: Sequence[ArmRecording]
+) -> tuple[ArmLoop, Sequence[ArmRecording], list[Message]]:
+    """Return a loop and recordings whose velocities are the logged ones only if these are less noisy, and a note.
+
+    Raises RecordingError if they are not the derivatives of the positions.
+    """
+    from scipy.signal import butter, sosfiltfilt
+
+    low_pass, noise = butter(3, loop.cutoff, fs=loop.sample_rate, output="sos"), np.zeros(2)
+    for recording in recordings:
+        if recording.velocity is None:
+            return loop, recordings, []
+        ends = itertools.pairwise((*recording.begins, recording.t.size))
+        rows = slice(*max(ends, key=lambda pair: pair[1] - pair[0]))
+        both = np.array([np.gradient(recording.q[rows], 1.0 / loop.sample_rate, axis=0), recording.velocity[rows]])
+        slow = sosfiltfilt(low_pass, both, axis=1)
+        noise += np.square(both - slow).mean((1, 2))
+        ratio = (slow[0] * slow[1]).sum(0) / np.maximum(np.square(slow[0]).sum(0), loop.rest_speed**2)
+        moves = np.abs(slow[0]).max(0) > loop.rest_speed
+        worst = int(np.argmax(np.abs(ratio - 1.0) * moves))
+        if moves[worst] and abs(ratio[worst] - 1.0) > MAX_VELOCITY_ERROR:
+            raise RecordingError(
+                f"{recording.name}: velocity of {arm.names[worst]} is {ratio[worst]:.3g} times the derivative of its"
+                " position: multiply its column accordingly, or leave velocity out"
+            )
+    if noise[1] < noise[0]:
+        return loop, recordings, [message("arm.velocity_used", share=float(np.sqrt(noise[1] / noise[0])))]
+    joints = {name: joint.model_copy(update={"velocity": None}) for name, joint in loop.joints.items()}
+    plain = [replace(recording, velocity=None) for recording in recordings]
+    return loop.model_copy(update={"joints": joints}), plain, [message("arm.velocity_left")]
 
 
 def _left_out_residuals(
@@ -148,14 +193,18 @@ def _learn_scatter(
         np.concatenate([X, deviation_columns(model, signal, X, fit.theta)], axis=1)
         for signal, X in zip(signals, designs, strict=True)
     ]
-    inflation = _inflation(signals, columns, residuals, fit.noise, len(fit.theta))
-    weight = fit.noise * np.sqrt(inflation)
-    whole = [
-        block_information(signal.t, *weighted(signal, X, e, weight))
-        for signal, X, e in zip(signals, columns, residuals, strict=True)
-    ]
-    moves = slice(len(fit.theta), None)
-    between = random_effect([_change(one, moves) for one in whole], scale, BETWEEN_SHARE)
+    moves, left = slice(len(fit.theta), None), residuals
+    for _ in range(2):  # by how recordings differ as a whole, they do not differ from block to block
+        inflation = _inflation(signals, columns, left, fit.noise, len(fit.theta))
+        weight = fit.noise * np.sqrt(inflation)
+        whole = [
+            block_information(signal.t, *weighted(signal, X, e, weight))
+            for signal, X, e in zip(signals, columns, residuals, strict=True)
+        ]
+        changes = [_change(one, moves) for one in whole]
+        between = random_effect(changes, scale, BETWEEN_SHARE)
+        own = [np.linalg.solve(A + np.diag(between**-2.0), g) for A, g in changes]
+        left = [e - np.einsum("jdm,d->jm", X[:, moves], d) for X, e, d in zip(columns, residuals, own, strict=True)]
     halves = [second_half(one.part(moves), np.diag(between**-2.0)) for one in whole]
     return _Scatter(inflation, whole, scale, between, random_effect(halves, scale, DRIFT_SHARE))
 

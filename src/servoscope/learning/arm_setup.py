@@ -16,7 +16,7 @@ from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import LoopError, NotEnoughError, RecordingError
 from servoscope.core.messages import Message, message
 from servoscope.core.settings import read_toml_text
-from servoscope.estimation.arm_regression import block_information, filter_arm_log
+from servoscope.estimation.arm_regression import ArmSignals, block_information, filter_arm_log
 from servoscope.models.arm.model import ArmModel
 from servoscope.models.arm.settings import DEFAULT_CUTOFF, ArmLoop
 from servoscope.models.arm.urdf import Kinematics, parse_urdf
@@ -27,7 +27,9 @@ from servoscope.signals.readers.guess_columns import guess_mapping, quoted_chann
 from servoscope.signals.readers.recording_file import read_channels
 
 # of the words in a column's name, without its joint
-ASKED_FOR = re.compile(r"target|des(?![a-z])|cmd|command|goal|soll|(?<![a-z])ref|_d(?![a-z])|vel|speed|error")
+ASKED_FOR = re.compile(r"target|des(?![a-z])|cmd|command|goal|soll|(?<![a-z])ref|_d(?![a-z])")
+VELOCITY = re.compile(r"vel|speed|(?<![a-z])(?:dq|qd)(?![a-z])")
+ERROR = re.compile(r"error")
 POSITION = re.compile(r"pos|angle|winkel|(?<![a-z])q(?![a-z])")
 TORQUE = re.compile(r"effort|torque|moment|(?<![a-z])tau")
 CURRENT = re.compile(r"cur|amps|strom|(?<![a-z])i(?![a-z])")
@@ -54,12 +56,20 @@ def propose_arm_loop(log: Path, urdf: Path, name: str) -> tuple[ArmLoop, dict[st
             f" its columns by the joints ({', '.join(arm.names)}) or number them, and make joints fixed in {urdf} that"
             f" no log has; the file has {', '.join(list(channels)[:12])}"
         )
+    optional = {
+        "velocity": _choose(columns, VELOCITY),
+        "target": _choose(columns, ASKED_FOR, POSITION, (VELOCITY, ERROR)),
+        "target_torque": _choose(columns, ASKED_FOR, TORQUE, (VELOCITY, ERROR)),
+    }
     guessed = guess_mapping(list(channels))
     time = {"time": guessed["time"] or "t", "time_unit": guessed["time_unit"]}
     joints: dict[str, dict[str, Any]] = {
         joint: {"position": quoted_channel(q), "torque": quoted_channel(i)}
         for joint, q, i in zip(arm.names, positions, torques, strict=True)
     }
+    for key, group in optional.items():
+        for joint, column in zip(arm.names, group or (), strict=bool(group)):
+            joints[joint][key] = quoted_channel(column)
     reach = max(max(abs(channels[q].min), abs(channels[q].max)) for q in positions)
     stamps = read_channels(log, Columns(**time, reference=positions[0], input=torques[0], output=positions[0]))[1]
     rate = float(f"{1.0 / np.median(np.diff(stamps)):.3g}")
@@ -75,9 +85,11 @@ def propose_arm_loop(log: Path, urdf: Path, name: str) -> tuple[ArmLoop, dict[st
     recording = read_arm_log(log, loop, arm)  # refuses positions beyond the limits of the URDF
     if torques == _choose(columns, TORQUE):
         return loop, why
-    for joint, gain in zip(arm.names, _nominal_gains(ArmModel(arm, loop), recording), strict=True):
+    reason = "init.arm_gain" if recording.target_torque is None else "init.arm_target_gain"
+    signals = filter_arm_log(recording, model := ArmModel(arm, loop))
+    for joint, gain in zip(arm.names, nominal_gains(model, recording, signals), strict=True):
         joints[joint]["gain"] = float(f"{gain or 1.0:.3g}")
-        why[f"{joint}.gain"] = message("init.arm_gain" if gain else "init.arm_no_gain")
+        why[f"{joint}.gain"] = message(reason if gain else "init.arm_no_gain")
     return ArmLoop.from_dict(table, str(log)), why
 
 
@@ -95,22 +107,41 @@ def _columns_by_joint(names: Sequence[str], arm: Kinematics) -> dict[str, tuple[
     return {what: group for what, group in ordered.items() if len(group) == arm.size}
 
 
-def _choose(columns: dict[str, tuple[str, ...]], words: re.Pattern[str]) -> tuple[str, ...] | None:
-    """Return the columns whose common name has one of the words, measured ones; None where there are none."""
-    fitting = (what for what in columns if words.search(what.lower()) and not ASKED_FOR.search(what.lower()))
-    return columns[what] if (what := next(fitting, None)) is not None else None
+def _choose(
+    columns: dict[str, tuple[str, ...]],
+    words: re.Pattern[str],
+    more: re.Pattern[str] | None = None,
+    unlike: Sequence[re.Pattern[str]] | None = None,
+) -> tuple[str, ...] | None:
+    """Return the columns whose common name has one of the words, of `more` too, and none of `unlike`; None without.
+
+    `unlike`: without it, of what is not measured, and of velocities but for them.
+    """
+    unlike = unlike or [pattern for pattern in (ASKED_FOR, VELOCITY, ERROR) if pattern is not words]
+    for what, group in columns.items():
+        if all(p.search(what.lower()) for p in (words, more or words)) and not any(
+            p.search(what.lower()) for p in unlike
+        ):
+            return group
+    return None
 
 
 @with_one_blas_thread
-def _nominal_gains(model: ArmModel, recording: ArmRecording) -> list[float | None]:
-    """Return the gains with which torques agree with the weights of the URDF; None where the weight shows little."""
-    signals = filter_arm_log(recording, model)
+def nominal_gains(model: ArmModel, recording: ArmRecording, signals: ArmSignals) -> list[float | None]:
+    """Return the gains with which torques agree with target torques, or else with the weights of the URDF.
+
+    As factors of the loop file's gains; None where they show little.
+    """
     still = np.zeros_like(signals.q)
     weight = model.inertial_torque(signals.q, still, still, model.base.nominal)
+    if recording.target_torque is not None:
+        weight = np.array([np.interp(signals.t, recording.t, own) for own in recording.target_torque.T])
     gains: list[float | None] = []
     for j in range(model.arm.size):
         v, used = signals.v[:, j], signals.moving[j]
-        others = np.column_stack([v, np.tanh(v / model.loop.sign_speed), np.ones(v.size), signals.a[:, j]])[used]
+        others = np.column_stack([v, np.tanh(v / model.loop.sign_speed), np.ones(v.size)])[used]
+        if recording.target_torque is None:  # which the weight does not hold
+            others = np.column_stack([others, signals.a[used, j]])
         both = np.column_stack([weight[j], signals.tau[j]])[used]
         x, i = (both - others @ np.linalg.lstsq(others, both)[0]).T if used.any() else np.zeros((2, 1))
         explained = float(x @ i) ** 2 / max(float(x @ x) * float(i @ i), 1e-300)

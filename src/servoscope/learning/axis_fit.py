@@ -284,7 +284,7 @@ def _with_own_limits(loop: Loop, model: AxisModel, recordings: Sequence[Recordin
         most = max(own)
         # the machine does what the terms do not know, and chance alone is no longer what a change has to exceed
         limit = (
-            score_limit([max(one, MIN_LOG_LIKELIHOOD_GAIN) for one in own], FALSE_ALARMS)
+            score_limit([max(gain, MIN_LOG_LIKELIHOOD_GAIN) for gain in own], FALSE_ALARMS)
             if HEALTHY_MARGIN * most > usual
             else 0.0
         )

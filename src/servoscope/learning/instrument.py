@@ -56,19 +56,19 @@ def learn_instrument(
 ) -> tuple[InstrumentalFit | None, list[Message]]:
     """Return the fit that takes the place of least squares, None where they may stay, and warnings."""
     source = source_of(recordings)
-    found = fit_with_instrument(pipeline, recordings, source, fit.tuning.theta)
-    if found is None:
+    estimate = fit_with_instrument(pipeline, recordings, source, fit.tuning.theta)
+    if estimate is None:
         return None, []
-    if not _is_biased(found, fit, recordings):
+    if not _is_biased(estimate, fit, recordings):
         return None, []
-    if source == "input" and has_feedback(found.pipeline, recordings, found.fit.tuning.theta):
+    if source == "input" and has_feedback(estimate.pipeline, recordings, estimate.fit.tuning.theta):
         return None, [message("learning.instrument_feedback")]
-    if not found.settled:
+    if not estimate.settled:
         return None, [message("learning.instrument_unsettled")]
-    if not found.trusted:
-        values = {"coefficient": found.weakest, "deviation": found.deviation, "limit": MAX_RELATIVE_STD}
+    if not estimate.trusted:
+        values = {"coefficient": estimate.weakest, "deviation": estimate.deviation, "limit": MAX_RELATIVE_STD}
         return None, [message("learning.instrument_refused", **values)]
-    return found, []
+    return estimate, []
 
 
 def _is_biased(found: InstrumentalFit, fit: TuningFit, recordings: Sequence[Recording]) -> bool:

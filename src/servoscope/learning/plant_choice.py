@@ -135,13 +135,13 @@ def choose_plant(
 
 
 def _is_as_good(candidate: PlantCandidate, best: PlantCandidate) -> bool:
-    more = 0.0
+    tolerance = 0.0
     if len(candidate.squares) == len(best.squares):
         difference = candidate.squares - best.squares
-        more = float(np.sqrt(len(difference)) * difference.std())
+        tolerance = float(np.sqrt(len(difference)) * difference.std())
     excess = best.worth - candidate.worth
     saved = best.coefficients - candidate.coefficients
-    return excess <= max(more, ((1.0 + MIN_GAIN) ** saved - 1.0) * (1.0 - best.explained), MIN_SHARE * saved)
+    return excess <= max(tolerance, ((1.0 + MIN_GAIN) ** saved - 1.0) * (1.0 - best.explained), MIN_SHARE * saved)
 
 
 def _simplicity(candidate: PlantCandidate, swings: bool) -> tuple[int, bool, bool]:
@@ -178,12 +178,12 @@ def _judge_cylinders(
     """
     judged: list[PlantCandidate] = []
     for contact in (None, *contacts):
-        more = {} if contact is None else {"contact": contact}
+        friction_settings = {} if contact is None else {"contact": contact}
         loads = ("spring",) if contact is None else ("spring", "process")
-        made = folds({"kind": "cylinder", "terms": [*loads, "overlap", "offset"], **more})
+        made = folds({"kind": "cylinder", "terms": [*loads, "overlap", "offset"], **friction_settings})
         for chosen in (list(loads), [*loads, "overlap"]):
             names = ("acceleration", *cylinder.BY_DIRECTION, *(cylinder.TERMS[term].coefficient for term in chosen))
-            candidate = _judge({"kind": "cylinder", "terms": [*chosen, "offset"], **more}, names, made)
+            candidate = _judge({"kind": "cylinder", "terms": [*chosen, "offset"], **friction_settings}, names, made)
             judged += [] if candidate is None else [candidate]
         if max((candidate.explained for candidate in judged), default=0.0) <= explained:
             break

@@ -85,7 +85,7 @@ def diagnose_packed_blocks(
     _: Callable[[str], None], baseline: str, name: str, packed: Sequence[tuple[int, bytes]]
 ) -> dict[str, Any]:
     """Diagnose a window in the worker's process."""
-    blocks = [Block.unpack(name, *one) for one in packed]
+    blocks = [Block.unpack(name, *fields) for fields in packed]
     return diagnose_blocks(_parse_baseline(baseline), name, blocks).model_dump(mode="json")
 
 

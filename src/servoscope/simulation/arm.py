@@ -99,7 +99,7 @@ def simulate_arm(seed: int, duration_s: float = 60.0, change: ArmChange | None =
         return np.asarray(tau + np.array(ROTOR) * a)
 
     # on the way that is meant: the loop's error does not change a load
-    load = np.abs(needed(reference[0], np.zeros_like(of["offset"]), np.zeros_like(of["offset"])))
+    load = np.abs(needed(*reference))
 
     def resist(v: FloatArray) -> FloatArray:
         return (coulomb + BY_LOAD * load) * np.tanh(v / SIGN_SPEED) + np.array(VISCOUS) * friction * v + of["offset"]

@@ -61,10 +61,10 @@ class AxisWindow(ChangeWindow):
         """Return all of a recording of a healthy axis; it begins at sample `first` of a longer one."""
         assert isinstance(loop.plant, AxisPlant)
         signals = axis_signals(loop, recording, model.stride, model.drive, model.moves)
-        each = [np.linalg.inv(np.linalg.cholesky(np.array(model.covariance)))] if model.parameters else []
+        root = [np.linalg.inv(np.linalg.cholesky(np.array(model.covariance)))] if model.parameters else []
         m = len(model.parameters)
         prior = np.zeros((m + 2, m + 2))
-        prior[:m, :m] = each[0] if each else 0.0
+        prior[:m, :m] = root[0] if root else 0.0
         prior[m:, m:] = np.diag([1.0 / model.offset_std, 1.0 / model.drift_std])
         return cls(
             model.plant(loop.plant),
@@ -150,11 +150,11 @@ class AxisWindow(ChangeWindow):
         output_gain = factors.pop(SENSOR_GAIN, 1.0)
         plant = self.plant.scaled(self.plant.expand_rays(factors))
         assert plant.coefficients is not None
-        each = plant.acceleration_coefficients()
+        coefficients = plant.acceleration_coefficients()
         # what grows with y as measured does so through its gain already
         degrees = np.array([0, *(column.degree for column in plant.acting)])
-        each = np.where(degrees == 0, output_gain, 1.0) * each
-        return np.concatenate([each, output_gain * np.asarray(added) / plant.coefficients["inertia"]])
+        coefficients = np.where(degrees == 0, output_gain, 1.0) * coefficients
+        return np.concatenate([coefficients, output_gain * np.asarray(added) / plant.coefficients["inertia"]])
 
     def _shares(self, profile: ChangeProfile, predictors: int) -> FloatArray:
         """Return how far each set of coefficients is in force, shape (p, N)."""
@@ -171,8 +171,8 @@ class AxisWindow(ChangeWindow):
         """
         if self._kept.get("profile") != (profile, predictors):
             parts = self._shares(profile, predictors)[:, None] * self.columns
-            found = self.filter.of_acceleration(parts.reshape(-1, self.samples), self.signals.runs)
-            self._kept.update(profile=(profile, predictors), responses=found * self._weight)
+            responses = self.filter.of_acceleration(parts.reshape(-1, self.samples), self.signals.runs)
+            self._kept.update(profile=(profile, predictors), responses=responses * self._weight)
         return np.asarray(self._kept["responses"])
 
     @cached_property
@@ -185,10 +185,10 @@ class AxisWindow(ChangeWindow):
 
     def variant_innovations(self, variants: Sequence[Array], profile: ChangeProfile) -> Array:
         """Return the innovations of each in standard deviations, shape (V, N)."""
-        each = np.array(variants)
-        responses, each = self._responses(profile, each.shape[1]), each.reshape(len(each), -1)
-        found = self._of_output * self._weight - each.real @ responses
-        return found - 1j * (each.imag @ responses) if np.iscomplexobj(each) else found
+        matrix = np.array(variants)
+        responses, matrix = self._responses(profile, matrix.shape[1]), matrix.reshape(len(matrix), -1)
+        innovations = self._of_output * self._weight - matrix.real @ responses
+        return innovations - 1j * (matrix.imag @ responses) if np.iscomplexobj(matrix) else innovations
 
     def disturbance_response(
         self, predictor: Array, profile: ChangeProfile, u: FloatArray, y: FloatArray
@@ -219,13 +219,13 @@ class AxisWindow(ChangeWindow):
         own = J[:, -sizes:] - Q @ (Q.T @ J[:, -sizes:])
         e = residual[:N]
         variance = float(e @ e) / self.used
-        found = [1.0]
+        inflations = [1.0]
         for column in own[:N].T:
             gamma = sample_autocovariance([column * e], lags)
             window = 1.0 - np.arange(1, lags + 1) / (lags + 1.0)
             white = variance * float(column @ column) / N
-            found.append(float(gamma[0] + 2.0 * (window * gamma[1:]).sum()) / max(white, 1e-300))
-        return max(found)
+            inflations.append(float(gamma[0] + 2.0 * (window * gamma[1:]).sum()) / max(white, 1e-300))
+        return max(inflations)
 
     def change_sums(self, d: FloatArray, names: Sequence[str], x: FloatArray, step: float, Q: FloatArray) -> ChangeSums:
         """Prepare the sums of products by onset; a drift grows in a straight line."""
@@ -240,9 +240,9 @@ class AxisWindow(ChangeWindow):
         signals, V = (self.filter.to_acceleration, self.filter.poles, added, e, self._weight, self.restart), len(added)
 
         def sums(onsets: IntArray, overs: IntArray) -> tuple[FloatArray, FloatArray]:
-            found = np.zeros((len(onsets), V, V + Q.shape[1]))
-            onset_sums(*signals, onsets, overs, Q, before, np.empty((V, 3)), np.empty(V), found)
-            return found, np.zeros(len(onsets))
+            costs = np.zeros((len(onsets), V, V + Q.shape[1]))
+            onset_sums(*signals, onsets, overs, Q, before, np.empty((V, 3)), np.empty(V), costs)
+            return costs, np.zeros(len(onsets))
 
         return sums
 

@@ -173,8 +173,8 @@ class HypothesisEvidence:
         """
         intervals = []
         for name, x, (low, high) in zip(fitted.names, fitted.x, self.intervals, strict=True):
-            more = 1.96 * float(np.hypot(spread.get(name, 0.0), model_error * x))
-            intervals.append((float(x - np.hypot(x - low, more)), float(x + np.hypot(high - x, more))))
+            widening = 1.96 * float(np.hypot(spread.get(name, 0.0), model_error * x))
+            intervals.append((float(x - np.hypot(x - low, widening)), float(x + np.hypot(high - x, widening))))
         return replace(self, intervals=tuple(intervals))
 
 
@@ -188,8 +188,8 @@ def integrate_evidence(
     """
     m, k = window.nuisance_count, len(found.x)
     H = found.jacobian.T @ found.jacobian / noise_variance
-    rest = H[:m, :m]
-    volume = -0.5 * float(np.linalg.slogdet(rest)[1]) if m else 0.0
+    nuisance = H[:m, :m]
+    volume = -0.5 * float(np.linalg.slogdet(nuisance)[1]) if m else 0.0
     if k == 1:
         return _evidence_along_size(window, found, scales[0], noise_variance, volume)
     log = volume - 0.5 * found.cost / noise_variance

@@ -22,8 +22,8 @@ def orthonormal_basis(columns: FloatArray) -> FloatArray:
 
     if not columns.shape[1]:
         return columns
-    each, size = normalise_columns(columns)
-    Q, R, _ = qr(each[:, size > RANK_TOLERANCE], mode="economic", pivoting=True)
+    scaled, size = normalise_columns(columns)
+    Q, R, _ = qr(scaled[:, size > RANK_TOLERANCE], mode="economic", pivoting=True)
     return np.asarray(Q[:, np.abs(np.diag(R)) > RANK_TOLERANCE])
 
 
@@ -35,8 +35,8 @@ def explained_sum_of_squares(J: FloatArray, residual: FloatArray) -> float:
 
 def solve_least_squares(J: FloatArray, residual: FloatArray) -> tuple[FloatArray, float]:
     """Return the unknowns that make ``residual + J step`` smallest, and the sum of squares that is left."""
-    each, size = normalise_columns(J)
-    Q, R = np.linalg.qr(each)
+    scaled, size = normalise_columns(J)
+    Q, R = np.linalg.qr(scaled)
     step = -np.linalg.lstsq(R, Q.T @ residual, rcond=None)[0] / size
     return step, float(((residual + J @ step) ** 2).sum())
 

@@ -43,9 +43,9 @@ def prepare_sums(
 
     def sums(onsets: IntArray, overs: IntArray) -> tuple[FloatArray, FloatArray]:
         plants = np.ascontiguousarray(drifting) if overs.any() else stepping
-        found, volume = np.empty((len(onsets), V, V + Q.shape[1])), np.empty(len(onsets))
-        sum_over_onsets(every, log_S, plants, 1.0 / step, onsets, overs, settle, *signals, found, volume, n=n)
-        return found, volume
+        costs, volume = np.empty((len(onsets), V, V + Q.shape[1])), np.empty(len(onsets))
+        sum_over_onsets(every, log_S, plants, 1.0 / step, onsets, overs, settle, *signals, costs, volume, n=n)
+        return costs, volume
 
     return sums
 

@@ -59,12 +59,13 @@ class CauseWindow:
         """What a unit of each adds to u and to y, shapes (N,)."""
         nothing, ones = np.zeros(self.window.samples), np.ones(self.window.samples)
         moving = delayed(speed_sign(self.window.y, self.window.sample_rate), 1)
-        found = {
+        disturbances = {
             "sensor_offset": (nothing, ones),
             "coulomb_friction": (-moving, nothing),
             "input_offset": (ones, nothing),
         }
-        return {name: both for name, both in found.items() if name not in self.window.plant.names}  # a fault of its own
+        own = self.window.plant.names  # what has a fault of its own
+        return {name: both for name, both in disturbances.items() if name not in own}
 
     @property
     def nonlinear(self) -> tuple[str, ...]:

@@ -39,7 +39,7 @@ def find_other_causes(refined: RefitResult, since: ChangeProfile | None = None) 
     if refined.is_unknown:
         if since is None:  # the onset of an explanation that is none may mean nothing
             earlier = _all_causes(refined, causes, ChangeProfile(refined.initial_onset))
-            others = min(others, earlier, key=lambda each: min(cause.cost for cause in each))
+            others = min(others, earlier, key=lambda causes: min(cause.cost for cause in causes))
         most = window.samples + (1.0 - MIN_EXPLAINED_SHARE) * (causes.healthy_cost - window.samples)
         enough = min(max(most, MAX_WHITE_VARIANCE * window.samples), best.cost)
         limit = min([cause.cost for cause in others if enough >= cause.cost], default=-np.inf)
@@ -60,7 +60,7 @@ def find_outside_onset(refined: RefitResult) -> OnsetEstimate | None:
     everywhere = {*starts, *np.linspace(0, refined.latest, FIRST_ONSETS).astype(int).tolist()}
     tried = [(causes.fit(name, k), k) for name in causes.nonlinear for k in sorted(starts)]
     tried += [(causes.fit(name, k), k) for name in causes.disturbances for k in sorted(everywhere)]
-    cause, onset = min(tried, key=lambda one: one[0].cost)
+    cause, onset = min(tried, key=lambda candidate: candidate[0].cost)
     parameter = min(refined.other_parameters, key=lambda fitted: fitted.cost, default=None)
     if parameter is not None and parameter.cost < cause.cost:
         estimate, cause = _parameter_onset(window, parameter, refined.latest)

@@ -119,29 +119,31 @@ class _HypothesisSearch:
         if self.window.follows:  # held, they would pass for the change
             never = ChangeProfile(self.window.samples)
             nothing = fit_hypothesis(self.window, [], never, nothing, [np.zeros(0)], free=True).d
-        found, singles = self._fit_singles(nothing)
-        self.profile = found.profile
+        estimate, singles = self._fit_singles(nothing)
+        self.profile = estimate.profile
         pairs = [
-            self._fit([*one.faults, *other.faults], nothing, [np.append(one.x, 0.0), np.append(0.0, other.x)])
-            for one, other in combinations([f for f in singles if f.faults[0].name not in self.rays], 2)
+            self._fit([*first.faults, *other.faults], nothing, [np.append(first.x, 0.0), np.append(0.0, other.x)])
+            for first, other in combinations([f for f in singles if f.faults[0].name not in self.rays], 2)
         ]
-        found, best = self._iterate_onset(found, [*singles, *pairs])
+        estimate, best = self._iterate_onset(estimate, [*singles, *pairs])
         everything = [best] if self._is_hopeless(best) else self._follow_onset([*singles, *pairs])
         if self._misfit(self._update_noise_variance(everything)) > 1.0:
             # no fault alone is near the truth, nor are the sizes that the pairs started from
             pairs = [self._refit_from_valleys(pair) for pair in pairs]
-            found, _ = self._iterate_onset(found, [*singles, *pairs])
+            estimate, _ = self._iterate_onset(estimate, [*singles, *pairs])
             everything = self._follow_onset([*singles, *pairs])
         best = self._update_noise_variance(everything)
         everything = [self._refit_own_onset(f, best) for f in everything]
-        if found.high - found.low <= MAX_SHARP_ONSET_SAMPLES and not found.profile.duration:
-            found, everything = self._sharpen_onset(found, everything)
+        if estimate.high - estimate.low <= MAX_SHARP_ONSET_SAMPLES and not estimate.profile.duration:
+            estimate, everything = self._sharpen_onset(estimate, everything)
         self.settled = True
         best = self._update_noise_variance(everything)
         if self.window.coloured:
-            settled, onset = self._onset(best), found.profile.onset
-            found = replace(settled, profile=found.profile, low=min(settled.low, onset), high=max(settled.high, onset))
-        return self._weigh(everything, found)
+            settled, onset = self._onset(best), estimate.profile.onset
+            estimate = replace(
+                settled, profile=estimate.profile, low=min(settled.low, onset), high=max(settled.high, onset)
+            )
+        return self._weigh(everything, estimate)
 
     def _sharpen_onset(
         self, found: OnsetEstimate, fitted: Sequence[HypothesisFit]
@@ -210,14 +212,14 @@ class _HypothesisSearch:
         for drifts in (False, True):
             for _ in range(MAX_LOOKS):
                 best = self._update_noise_variance(singles)
-                found = self._onset(best, drifts)
-                if found.profile == self.profile:
+                estimate = self._onset(best, drifts)
+                if estimate.profile == self.profile:
                     break
-                singles = self._fit_each_fault(found.profile, d, grids, singles)
+                singles = self._fit_each_fault(estimate.profile, d, grids, singles)
                 gained = best.cost - self._update_noise_variance(singles).cost
                 if gained < MIN_LOOK_GAIN * self.noise_variance:
                     break
-        return found, singles
+        return estimate, singles
 
     def _fit_each_fault(
         self, profile: ChangeProfile, d: FloatArray, grids: Sequence[SizeGrid], known: Sequence[HypothesisFit] = ()
@@ -225,9 +227,9 @@ class _HypothesisSearch:
         """Fit every fault alone, from the local minima of its grid and from a known size."""
         self.profile = profile
         starts = [grid.local_minima(self.window, profile) for grid in grids]
-        for each, other in zip(starts, known, strict=False):
-            each.append(other.x)
-        return [self._fit([fault], d, each) for fault, each in zip(self.faults, starts, strict=True)]
+        for start, other in zip(starts, known, strict=False):
+            start.append(other.x)
+        return [self._fit([fault], d, start) for fault, start in zip(self.faults, starts, strict=True)]
 
     def _fit(self, faults: Sequence[Fault], d: FloatArray, starts: Sequence[FloatArray]) -> HypothesisFit:
         self.progress()
@@ -275,20 +277,20 @@ class _HypothesisSearch:
 
     def _variance(self, fitted: HypothesisFit) -> float:
         """Return the variance of the innovations, as large as the scatter of their scores says."""
-        found = fitted.cost / self.window.used
+        variance = fitted.cost / self.window.used
         if not self.settled:  # far from the truth scores hang together because the explanation is wrong
-            return found
-        return found * self.window.inflation(fitted.jacobian, fitted.residual, len(fitted.x))
+            return variance
+        return variance * self.window.inflation(fitted.jacobian, fitted.residual, len(fitted.x))
 
     def _onset(self, fitted: HypothesisFit, drifts: bool = True) -> OnsetEstimate:
-        found = onset_posterior(self.window, fitted, self.latest, self.noise_variance, drifts)
+        estimate = onset_posterior(self.window, fitted, self.latest, self.noise_variance, drifts)
         begin = fitted.profile.onset
-        if not self.window.follows or abs(found.profile.onset - begin) <= MAX_SHARP_ONSET_SAMPLES:
-            return found
+        if not self.window.follows or abs(estimate.profile.onset - begin) <= MAX_SHARP_ONSET_SAMPLES:
+            return estimate
         # a size that is large, and healthy parameters that follow, are not linear so far from where they were fitted
         most = fitted.cost + ONSET_MISFIT_VARIANCES * self.noise_variance
-        is_worse = self._refit_at(fitted, found.profile).cost > most
-        return OnsetEstimate(fitted.profile, begin, begin, found.size_std) if is_worse else found
+        is_worse = self._refit_at(fitted, estimate.profile).cost > most
+        return OnsetEstimate(fitted.profile, begin, begin, estimate.size_std) if is_worse else estimate
 
     def _weigh(self, fitted: Sequence[HypothesisFit], found: OnsetEstimate) -> RefitResult:
         window, n = self.window, len(self.faults)
@@ -366,10 +368,10 @@ class _HypothesisSearch:
         return bool(np.abs(pair.x - size * direction).max() <= trusted)
 
     def _evidence(self, fitted: HypothesisFit, scales: Mapping[Fault, SizePrior]) -> HypothesisEvidence:
-        each = [
+        sizes = [
             scales.get(fault) or SizePrior.from_window(self.window, fault, fitted.profile) for fault in fitted.faults
         ]
-        return integrate_evidence(self.window, fitted, each, self.noise_variance)
+        return integrate_evidence(self.window, fitted, sizes, self.noise_variance)
 
     def _goodness(self, fitted: HypothesisFit) -> GoodnessOfFit:
         window, profile = self.window, fitted.profile

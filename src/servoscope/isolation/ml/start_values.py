@@ -97,16 +97,16 @@ def fit_further_parameters(
 ) -> list[HypothesisFit]:
     """Fit every further parameter of the plant, and the gain of the sensor of y."""
     known = {**window.plant.causes, SENSOR_GAIN: "a gain error of the sensor of y"}
-    found = []
+    fits = []
     for name, words in known.items():
         fault = Fault(name, name, FURTHER_RANGE, words)
         starts = SizeGrid.from_window(window, fault, best.d).local_minima(window, profile)
-        found.append(fit_hypothesis(window, [fault], profile, best.d, starts, free=False))
-    return refit_contenders_jointly(window, found, noise_variance, best.cost)
+        fits.append(fit_hypothesis(window, [fault], profile, best.d, starts, free=False))
+    return refit_contenders_jointly(window, fits, noise_variance, best.cost)
 
 
 def _local_minima(cost: FloatArray) -> npt.NDArray[np.int64]:
     """Return where the lowest valleys of a table are, the lowest first, shape (v, cost.ndim)."""
     around = np.lib.stride_tricks.sliding_window_view(np.pad(cost, 1, constant_values=np.inf), (3,) * cost.ndim)
-    found = np.argwhere(cost <= around.min(axis=tuple(range(-cost.ndim, 0))))
-    return found[np.argsort(cost[tuple(found.T)])][:VALLEYS]
+    minima = np.argwhere(cost <= around.min(axis=tuple(range(-cost.ndim, 0))))
+    return minima[np.argsort(cost[tuple(minima.T)])][:VALLEYS]

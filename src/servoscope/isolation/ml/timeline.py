@@ -117,7 +117,7 @@ class _TimelineSearch:
             fitted = list(self._fit_stretches(best))
             sequence = self._sequence([HEALTHY, *known.values(), *(plant for _, plants in fitted for plant in plants)])
             plant_sequence = min(
-                sequence, self._place([(k, plants[0]) for k, plants in fitted]), key=lambda one: one.cost
+                sequence, self._place([(k, plants[0]) for k, plants in fitted]), key=lambda candidate: candidate.cost
             )
             if plant_sequence.cost > best.cost - MIN_ROUND_GAIN:
                 break
@@ -179,7 +179,7 @@ class _TimelineSearch:
                     for other in others
                     if other is not plant
                 ),
-                key=lambda one: one.cost,
+                key=lambda candidate: candidate.cost,
             )
             if short or without.cost <= found.cost:
                 return self._drop_needless(without)
@@ -203,7 +203,7 @@ class _TimelineSearch:
             ]
             if min(fit.cost for fit in fitted) > part.samples + SWITCH_PRICE:
                 fitted += list(self._fit_pairs(part, fitted))
-            ranked = sorted([healthy, *fitted], key=lambda one: one.cost + SIZE_PRICE * len(one.x))
+            ranked = sorted([healthy, *fitted], key=lambda fit: fit.cost + SIZE_PRICE * len(fit.x))
             yield begin, [ChangedPlant(fit.faults, fit.x) if fit.faults else HEALTHY for fit in ranked]
 
     def _fit_pairs(self, part: RefitWindow, singles: Sequence[HypothesisFit]) -> Iterator[HypothesisFit]:

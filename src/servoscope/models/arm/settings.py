@@ -18,6 +18,7 @@ from servoscope.models.arm.dynamics import STANDARD_GRAVITY
 from servoscope.models.arm.urdf import Kinematics, parse_urdf
 from servoscope.models.loop import Loop
 
+OF_ALL_JOINTS = ("velocity", "target", "target_torque")  # columns that all joints have, or none
 DEFAULT_CUTOFF = 5.0  # Hz; the motion of an arm lies below, the ripple of its gears above
 
 
@@ -35,6 +36,9 @@ class JointColumns(Settings):
     gain: Annotated[Finite, AfterValidator(_not_zero)] = 1.0  # drive gain [N m per unit of `torque`]
     offset: Finite = 0.0  # added to the position, for a zero other than the URDF's [rad or m]
     temperature: NonEmptyStr | None = None  # of the joint, on which its friction may depend
+    velocity: NonEmptyStr | None = None  # as the position, used where it is less noisy than its derivative
+    target: NonEmptyStr | None = None  # position that the controller asks for
+    target_torque: NonEmptyStr | None = None  # that the controller asks for, without friction [N m or N]
     # periods of the torque ripple per turn of the joint, for example the teeth of a gear
     ripple: tuple[Positive, ...] = ()
 
@@ -72,6 +76,9 @@ class ArmLoop(Settings):
         if self.cutoff >= self.sample_rate / 5.0:
             raise ValueError(f"cutoff: {self.cutoff:g} Hz is not below a fifth of sample_rate, lower it")
         n = len(self.joints)
+        for key in OF_ALL_JOINTS:
+            if 0 < [getattr(joint, key) for joint in self.joints.values()].count(None) < n:
+                raise ValueError(f"joints: {key} must be given of all joints, or of none")
         if self.gears is not None:
             if len(self.gears) != n or any(len(row) != n for row in self.gears):
                 raise ValueError(f"gears: must be {n} rows of {n} numbers, a row per motor and a number per joint")

@@ -88,7 +88,7 @@ class _Tree:
         """Return the moving joints, depth first."""
         if len(self.bases) != 1:
             raise ValueError(f"has {len(self.bases)} links that no joint carries, exactly one must be the base")
-        found: list[tuple[ET.Element, int, FloatArray, FloatArray]] = []
+        chain: list[tuple[ET.Element, int, FloatArray, FloatArray]] = []
         inertial: list[FloatArray] = []
         waiting = [(self.bases[0], -1, np.eye(3), np.zeros(3))]
         while waiting:
@@ -102,27 +102,27 @@ class _Tree:
                 if joint.get("type") == "fixed":
                     waiting.append((child, moving, R_joint, p_joint))
                 elif joint.get("type") in MOVING_TYPES:
-                    found.append((joint, moving, R_joint, p_joint))
+                    chain.append((joint, moving, R_joint, p_joint))
                     inertial.append(np.zeros(10))
-                    waiting.append((child, len(found) - 1, np.eye(3), np.zeros(3)))
+                    waiting.append((child, len(chain) - 1, np.eye(3), np.zeros(3)))
                 else:
                     kind = joint.get("type")
                     raise ValueError(f"joint {_name(joint)!r}: joints of type {kind!r} are not supported")
-        if not found:
+        if not chain:
             raise ValueError("has no moving joint")
-        names = tuple(_name(joint) for joint, *_ in found)
+        names = tuple(_name(joint) for joint, *_ in chain)
         for name, parameters in zip(names, inertial, strict=True):
             if parameters[0] <= 0.0:
                 raise ValueError(f"the link behind joint {name!r} has no inertia: add <inertial> with its mass")
         return Kinematics(
             names,
-            tuple(moving for _, moving, *_ in found),
-            tuple(joint.get("type") == "prismatic" for joint, *_ in found),
-            np.array([R for *_, R, _ in found]),
-            np.array([p for *_, p in found]),
-            np.array([_axis(joint) for joint, *_ in found]),
+            tuple(moving for _, moving, *_ in chain),
+            tuple(joint.get("type") == "prismatic" for joint, *_ in chain),
+            np.array([R for *_, R, _ in chain]),
+            np.array([p for *_, p in chain]),
+            np.array([_axis(joint) for joint, *_ in chain]),
             np.array(inertial),
-            np.array([_limits(joint) for joint, *_ in found]),
+            np.array([_limits(joint) for joint, *_ in chain]),
         )
 
 

@@ -37,8 +37,8 @@ def _built_in() -> dict[str, type[Plant]]:
     modules = [
         importlib.import_module(f"{__name__}.{module_info.name}") for module_info in pkgutil.iter_modules(__path__)
     ]
-    classes = {each for module in modules for each in vars(module).values() if isinstance(each, type)}
-    plants = [each for each in classes if issubclass(each, Plant) and not inspect.isabstract(each)]
+    classes = {member for module in modules for member in vars(module).values() if isinstance(member, type)}
+    plants = [candidate for candidate in classes if issubclass(candidate, Plant) and not inspect.isabstract(candidate)]
     return {str(plant.model_fields["kind"].default): plant for plant in plants}
 
 

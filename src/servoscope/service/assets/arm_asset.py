@@ -83,7 +83,7 @@ class ArmAsset(Asset):
             is_row |= is_again or fault_names(faults) != fault_names(known.faults)
         is_row |= any(warning["kind"] == "event" for warning in diagnosis.document.get("warnings", []))
         evaluation = self._evaluate(t, diagnosis, is_fault=is_fault)
-        pending = tuple(each for each in state.pending_diagnoses if each != window)
+        pending = tuple(waiting for waiting in state.pending_diagnoses if waiting != window)
         state = self.take_state()  # its rows are counted
         self.state = replace(state, examination=examination, evaluation=evaluation, pending_diagnoses=pending)
         if is_row:
@@ -99,8 +99,8 @@ class ArmAsset(Asset):
         before, evidence = self.take_state().evaluation, diagnosis.document.get("evidence")
         if evidence is None:
             return before
-        found = diagnosis.document["parameters"].items()
-        parameters = tuple((name, each["value"], each["std"], each["nominal"]) for name, each in found)
+        estimates = diagnosis.document["parameters"].items()
+        parameters = tuple((name, row["value"], row["std"], row["nominal"]) for name, row in estimates)
         self._add_row("residuals", **history_row(t, evidence, 0.0, ()))
         if period_number(t) != period_number(before.t):
             self._add_sizes(coefficient_rows(t, parameters))

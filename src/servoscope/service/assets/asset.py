@@ -101,8 +101,8 @@ class Asset(StateHolder):
         since, until = rest_period(state.examination)
         from_s, to_s = self._alarms.standstill(state, self.reception)
         undisturbed = self.reception == RECEPTION_OK and not self._ticked
-        rest = RestPeriod(state.examination.verdict == "fault", max(since, from_s), min(until, to_s))
-        self._row = states.put(row, state, rest if undisturbed else rest._replace(until=-math.inf))
+        period = RestPeriod(state.examination.verdict == "fault", max(since, from_s), min(until, to_s))
+        self._row = states.put(row, state, period if undisturbed else period._replace(until=-math.inf))
 
     @property
     def reception(self) -> Reception:
@@ -314,7 +314,7 @@ class Asset(StateHolder):
             return StepResult([], [])
         first = self._is_first_diagnosis(window)
         examination, diagnosis = accept_diagnosis(state.examination, window, diagnosis, first=first)
-        pending = tuple(each for each in state.pending_diagnoses if each != window)
+        pending = tuple(waiting for waiting in state.pending_diagnoses if waiting != window)
         self.state = replace(state, examination=examination, pending_diagnoses=pending)
         values = {"number": window.number, "t": window.until, "grounds": window.why, **diagnosis.columns()}
         self._window.trim(self.take_state().position.t, self.take_state().pending_diagnoses)

@@ -37,6 +37,10 @@ class ArmRecording:
     torque: FloatArray  # (N, n) [N m or N], in units of the log times the drive gain
     temperature: FloatArray  # (N, n) of the joints; 0 where it is not logged
     tool: FloatArray  # (N,) mass that the arm is known to carry [kg]; 0 where it is not logged
+    # (N, n) where they are logged
+    velocity: FloatArray | None = None  # [rad/s or m/s]
+    target: FloatArray | None = None  # [rad or m]
+    target_torque: FloatArray | None = None  # [N m or N]
 
     @property
     def duration_s(self) -> float:
@@ -50,17 +54,13 @@ def read_arm_log(path: Source | Path, loop: ArmLoop, arm: Kinematics) -> ArmReco
     Raises RecordingError if the log cannot be used.
     """
     joints = loop.columns_of(arm)
-    wanted = {f"{name}.position": joint.position for name, joint in zip(arm.names, joints, strict=True)}
-    wanted |= {f"{name}.torque": joint.torque for name, joint in zip(arm.names, joints, strict=True)}
-    wanted |= {f"{n}.temperature": j.temperature for n, j in zip(arm.names, joints, strict=True) if j.temperature}
-    wanted |= {"tool": loop.tool} if loop.tool is not None else {}
     columns = Columns(
         time=loop.time,
         time_unit=loop.time_unit,
         reference=joints[0].position,
         input=joints[0].torque,
         output=joints[0].position,
-        covariates=wanted,
+        covariates=loop.channels,
     )
     name, stamps, channels = read_channels(path, columns)
     axis = build_time_axis(stamps, None, None, name, regular=False)
@@ -85,10 +85,13 @@ def read_arm_log(path: Source | Path, loop: ArmLoop, arm: Kinematics) -> ArmReco
         stamps.size,
         rows.t - rows.t[0],
         (0, *gaps.tolist()),
-        _joint_positions(loop, arm, resampled),
+        _joint_motion(loop, arm, resampled, "position"),
         _joint_torques(loop, arm, resampled),
         np.column_stack([resampled.get(f"{name}.temperature", np.zeros(rows.t.size)) for name in arm.names]),
         resampled.get("tool", np.zeros(rows.t.size)),
+        _joint_motion(loop, arm, resampled, "velocity") if joints[0].velocity else None,
+        _joint_motion(loop, arm, resampled, "target") if joints[0].target else None,
+        _joint_columns(arm, resampled, "target_torque") if joints[0].target_torque else None,
     )
     if recording.duration_s < MIN_DURATION_S:
         raise RecordingError(
@@ -98,18 +101,21 @@ def read_arm_log(path: Source | Path, loop: ArmLoop, arm: Kinematics) -> ArmReco
     return recording
 
 
-def _joint_positions(loop: ArmLoop, arm: Kinematics, channels: Mapping[str, FloatArray]) -> FloatArray:
-    logged = np.column_stack([channels[f"{name}.position"] for name in arm.names])
+def _joint_columns(arm: Kinematics, channels: Mapping[str, FloatArray], what: str) -> FloatArray:
+    return np.column_stack([channels[f"{name}.{what}"] for name in arm.names])
+
+
+def _joint_motion(loop: ArmLoop, arm: Kinematics, channels: Mapping[str, FloatArray], what: str) -> FloatArray:
+    logged = _joint_columns(arm, channels, what)
     if loop.angle_unit == "deg":
         logged = logged * np.where(arm.prismatic, 1.0, DEGREE)
-    offsets = np.array([joint.offset for joint in loop.columns_of(arm)])
+    offsets = np.array([joint.offset for joint in loop.columns_of(arm)]) * (what != "velocity")
     return np.asarray(np.linalg.solve(loop.gear_matrix(arm), logged.T).T + offsets)
 
 
 def _joint_torques(loop: ArmLoop, arm: Kinematics, channels: Mapping[str, FloatArray]) -> FloatArray:
-    logged = np.column_stack([channels[f"{name}.torque"] for name in arm.names])
     gains = np.array([joint.gain for joint in loop.columns_of(arm)])
-    return np.asarray((logged * gains) @ loop.gear_matrix(arm))
+    return np.asarray((_joint_columns(arm, channels, "torque") * gains) @ loop.gear_matrix(arm))
 
 
 def _check_range(recording: ArmRecording, loop: ArmLoop, arm: Kinematics) -> None:

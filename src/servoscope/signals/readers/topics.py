@@ -23,6 +23,8 @@ Topics = Mapping[str, Mapping[str, npt.NDArray[Any]]]
 def open_mcap(path: Path) -> TableFile:
     """Open an MCAP file with messages of ROS 2; ``/joint_states.position[0]`` is a field of a topic.
 
+    Arrays of a message with as many names have fields by name, too: ``/joint_states.position[elbow]``.
+
     The time of a message is its header's stamp where it has one, else when it was logged.
     """
     from mcap.reader import make_reader
@@ -89,13 +91,17 @@ def _open_messages(path: Path, messages: Iterable[tuple[str, int, Any]]) -> Tabl
 
 def _message_fields(message: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, float]]:
     """Walk the numbers of a message."""
+    labels = getattr(message, "name", None)  # of joints: their order may differ between messages
     for name in getattr(message, "__slots__", ()):
         value = getattr(message, name)
         if isinstance(value, bool | int | float):
             yield f"{prefix}{name}", float(value)
         elif isinstance(value, list | tuple | np.ndarray) and len(value) <= MAX_ARRAY_LENGTH:
+            own = labels if isinstance(labels, list) and len(labels) == len(value) else ()
             for index, item in enumerate(value):
                 if isinstance(item, bool | int | float | np.number):
+                    if own:
+                        yield f"{prefix}{name}[{own[index]}]", float(item)
                     yield f"{prefix}{name}[{index}]", float(item)
                 elif depth < 4:
                     yield from _message_fields(item, f"{prefix}{name}[{index}].", depth + 1)
