@@ -14,7 +14,7 @@ from accuracy.axis import AXES, Axis, loop, moves, random_motion, record
 from accuracy.rig import SEEDS_PER_UNIT
 from accuracy.scenario import Numbers, Row, Scenario, Table
 from servoscope.core.arrays import FloatArray
-from servoscope.diagnosis.examine import Examination
+from servoscope.evidence.examination import Examination
 
 Motion = Callable[[int], FloatArray]
 MOTIONS: dict[str, Motion] = {

@@ -10,7 +10,7 @@ import numpy as np
 
 import servoscope as ss
 from servoscope.core.arrays import FloatArray
-from servoscope.diagnosis.examine import Examination
+from servoscope.evidence.examination import Examination
 from servoscope.scoring import events
 from servoscope.simulation import FaultEvent, reference
 from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD

@@ -12,9 +12,9 @@ import servoscope as ss
 from accuracy.rig import FAULT_AT
 from accuracy.scenario import Numbers, Row
 from servoscope.diagnosis.diagnose import MIN_CERTAINTY
-from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.ml_refit import refit_candidates, refit_onset, refit_recording
 from servoscope.diagnosis.recording_alarm import first_alarm
+from servoscope.evidence.examination import Examination
 from servoscope.isolation.candidate import UNKNOWN, Candidate
 from servoscope.isolation.ml import find_other_causes
 from servoscope.research.paper.conditions import FAULT_NAMES

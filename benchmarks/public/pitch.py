@@ -28,7 +28,7 @@ from public.pitch_turbine import DYNAMICS, ONSET_S, RAMP_S, RATE, SENSOR_KINDS, 
 from servoscope.baseline.sensors import find_sensor_deviation
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.diagnosis.monitor import Monitor
-from servoscope.diagnosis.sensor_check import wrong_sensor
+from servoscope.evidence.sensors import wrong_sensor
 from servoscope.scoring import FaultIndices, alarm_rate, events, fault_indices
 
 LEARNED_S, CASE_S, HOUR_S = 600.0, 600.0, 3600.0

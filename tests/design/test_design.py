@@ -34,8 +34,8 @@ from servoscope.design.isolability import ambiguous_sizes, hypothesis_distances
 from servoscope.design.mimics import match_mimic, mimic_causes
 from servoscope.design.operating_limits import operating_limits
 from servoscope.design.scenario import Scenario
-from servoscope.diagnosis.examine import Examination
 from servoscope.estimation.noise_model import WhiteNoise
+from servoscope.evidence.examination import Examination
 from servoscope.isolation.ml.hypothesis import fit_hypothesis
 from servoscope.isolation.ml.window import RefitWindow
 from servoscope.learning.learn import nominal_baseline

@@ -7,8 +7,8 @@ from importlib.resources import files
 import pytest
 
 import servoscope as ss
-from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.own_past import examine_by_own_past
+from servoscope.evidence.examination import Examination
 from servoscope.simulation import FaultEvent, reference
 
 DAYS = 1.04, 0.95, 1.06, 0.97  # of the leakage: about 4 to 5 % of scatter

@@ -10,7 +10,7 @@ import pytest
 from scipy.signal import lfilter
 
 import servoscope as ss
-from servoscope.detection.signal_defects import find_signal_defect, find_switched_off
+from servoscope.evidence.signals import find_signal_defect, find_switched_off
 from servoscope.isolation.ml.axis_scan import find_axis_change, scan_limit
 from servoscope.isolation.ml.axis_vibration import BANDS
 from servoscope.learning.axis_fit import SCATTER, AxisFit, combine_fits, fit_axis, relative_scatter

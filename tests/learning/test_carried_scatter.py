@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import servoscope as ss
-from servoscope.diagnosis.examine import Examination
+from servoscope.evidence.examination import Examination
 from servoscope.learning.detectability import forecast_changes
 from servoscope.learning.scatter import carry_scatter
 from servoscope.simulation import FaultEvent, simulate

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from servoscope.core.errors import OutputError
+from servoscope.estimation.reference_period import reference_period
 from servoscope.learning.inspection import Inspection, inspect
-from servoscope.learning.inspection.residual import reference_period
 from servoscope.learning.inspection.signals import quantisation
 from servoscope.models.loop import Columns, Loop
 from servoscope.report import inspection_figures, inspection_page

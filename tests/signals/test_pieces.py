@@ -20,9 +20,9 @@ from servoscope.core import outofcore
 from servoscope.core.errors import RecordingError
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.diagnose import diagnose, diagnose_with_trace
-from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.operating_points import learn
 from servoscope.diagnosis.result import Diagnosis
+from servoscope.evidence.examination import Examination
 from servoscope.models.loop import Columns, Loop
 from servoscope.signals import Recording
 from servoscope.signals.readers import csv, parquet, read

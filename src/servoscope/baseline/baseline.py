@@ -11,16 +11,12 @@ from typing import Any, Self
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
-from servoscope.baseline.axis_model import AxisModel
-from servoscope.baseline.covariates import CovariateModel
-from servoscope.baseline.feature_model import FeatureModel
+from servoscope.baseline.learned_evidence import LearnedEvidence
 from servoscope.baseline.learned_fault import LearnedFault
 from servoscope.baseline.motion import MotionRange
 from servoscope.baseline.plant_fit import fault_directions, match_ratios
-from servoscope.baseline.pressure_model import PressureModel
 from servoscope.baseline.records import (
     AlarmThresholds,
-    BaselineMemory,
     BaselineSource,
     Detectability,
     ExactPredictorFit,
@@ -32,8 +28,6 @@ from servoscope.baseline.records import (
     Vector,
     parse_stored_loop,
 )
-from servoscope.baseline.residual_model import ResidualModel
-from servoscope.baseline.sensors import SensorModel
 from servoscope.baseline.threshold import t2_threshold
 from servoscope.baseline.version_2 import FLAT_VERSION, group_flat_fields
 from servoscope.core.arrays import FloatArray
@@ -52,7 +46,7 @@ VERSION = 3
 SETTLED_MEMORIES = 3.0  # memories, after which 5 % of the start are left
 
 
-class Baseline(ShortRepr, BaselineMemory):
+class Baseline(ShortRepr, LearnedEvidence):
     """What a healthy loop looks like to the monitor; everything that `diagnose` needs.
 
     Parameters
@@ -103,13 +97,6 @@ class Baseline(ShortRepr, BaselineMemory):
     notes: tuple[MessageText, ...]
     learned: tuple[LearnedFault, ...] = ()
     exact: ExactPredictorFit | None = None
-    sensors: SensorModel | None = None
-    features: FeatureModel | None = None
-    motion: MotionRange | None = None
-    axis: AxisModel | None = None
-    covariates: CovariateModel | None = None
-    residual: ResidualModel | None = Field(default=None, exclude_if=lambda value: value is None)
-    pressures: PressureModel | None = Field(default=None, exclude_if=lambda value: value is None)
     point: str = ""
     others: tuple[Baseline, ...] = ()
     revision: Revision = Revision()

@@ -26,6 +26,7 @@ WINDOWS = ((2.0, False), (4.0, True))
 KIND_TOLERANCE = 0.05  # relative excess by which recordings of one kind of motion differ
 MIN_WINDOW_SHARE = 0.5  # of a window, from which what it holds of the recording's beginning counts
 MIN_MOTION_SHARE = 1e-3  # of the largest value of a quantity: below, r or y counts as still
+MIN_CHANGE_STDS = 3.0  # of the error of extrapolation, from which on a change under a motion never seen is one
 MIN_DIRECTION_SHARE = 1e-6  # of the mean square of a regressor: directions without motion say nothing
 AT_ONCE = 8192  # evaluations that are compared together
 SIGNALS = 2  # r and y
@@ -111,6 +112,16 @@ class RecordedMotion:
         chunks = outofcore.iter_chunks(*at.indices(len(self.sums) - 1)[:2], self.sums, at_once=AT_ONCE)
         parts = [motion_excess(self.pipeline, seen, *self.quantities(rows)) for rows in chunks]
         return np.concatenate(parts) if parts else np.empty((0, len(QUANTITIES)))
+
+    def tells(self, change: FloatArray, covariance: FloatArray, at: slice) -> BoolArray:
+        """Return where a change of coefficients (K, n) is larger than uncertain ones of a covariance (K, n, n) explain.
+
+        Both as forces in the motion at evaluations, along the change: `MIN_CHANGE_STDS` standard deviations.
+        """
+        means, n = self._means(at, *WINDOWS[0])[0], change.shape[1]
+        force = np.einsum("kij,kj->ki", means[:, SIGNALS * MOMENTS :].reshape(-1, n, n), change)
+        error = np.einsum("ki,kij,kj->k", force, covariance, force)
+        return np.asarray((force * change).sum(axis=1) ** 2 > MIN_CHANGE_STDS**2 * error)
 
     def model_error(self, seen: MotionRange, tuning: Tuning, at: slice) -> FloatArray:
         """Return `model_error_covariance` at evaluations, shape (K, n, n)."""

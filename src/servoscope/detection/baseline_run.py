@@ -8,9 +8,13 @@ import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.expectation import NO_REFERENCE, Expectation, MeanPropagator
+from servoscope.core import outofcore
 from servoscope.detection.cusum_design import build_cusum_constants, sure_level, worst_case_hypotheses
 from servoscope.estimation.kernel.cusum import CusumConstants
-from servoscope.estimation.pipeline import EstimationRunner, Pipeline
+from servoscope.estimation.pipeline import EstimationRunner, Pipeline, RegressionRunner, Tuning
+from servoscope.signals import Recording
+
+MIN_INSTRUMENT_EIGENVALUE = 0.05  # of 1; below, the recursion follows too slowly, and below 0 it runs away
 
 
 class BaselineRun(NamedTuple):
@@ -57,3 +61,23 @@ def cusum_constants(
         hypotheses = worst_case_hypotheses(expectation, plant, baseline.healthy.loudest, covariance, hypotheses)
     budget = baseline.thresholds.calibration.sequential_budget(baseline.loop)
     return build_cusum_constants(pipeline, plant, noise, np.array(baseline.recursion.scale), hypotheses, budget)
+
+
+def has_failed_instrument(pipeline: Pipeline, tuning: Tuning, recording: Recording) -> bool:
+    """Return whether the instrument of the nominal loop tells nothing of this recording's motion, or the contrary.
+
+    The mean of theta moves by -E[z z']^-1 E[z phi'] theta/N: its eigenvalues tell where it goes. Coefficients that an
+    instrument has been learned for are not those of the AKF, which therefore cannot take over there.
+    """
+    if not pipeline.bank.has_instrument:
+        return False
+    runner, scale = RegressionRunner(pipeline), tuning.scale
+    own = shared = np.zeros((len(scale), len(scale)))
+    for rows in outofcore.iter_chunks(0, recording.samples):
+        part = recording.rows(rows)
+        g = runner.advance(part.r, part.u, part.y, part.restart)
+        z, phi = g.z[g.ok] / scale, g.phi[g.ok] / scale
+        own, shared = own + z.T @ z, shared + z.T @ phi
+    if not own.any():
+        return False
+    return bool(np.linalg.eigvals(np.linalg.lstsq(own, shared, rcond=None)[0]).real.min() < MIN_INSTRUMENT_EIGENVALUE)

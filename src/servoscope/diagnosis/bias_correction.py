@@ -13,11 +13,11 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
 from servoscope.detection.onset import Onset
 from servoscope.detection.trace import Trace
-from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.result import VIBRATION
 from servoscope.estimation import frequency_response
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.frequency_response import FrequencyResponse
+from servoscope.evidence.examination import Examination
 from servoscope.fit.search import Experiment, fit
 from servoscope.isolation.candidate import UNKNOWN, Candidate
 from servoscope.models.plants import Plant

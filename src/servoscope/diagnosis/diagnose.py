@@ -16,15 +16,12 @@ from servoscope.core.errors import RecordingError, SimulationError
 from servoscope.core.messages import Message, message
 from servoscope.detection.louder_noise import find_louder_noise
 from servoscope.detection.onset import Onset
-from servoscope.detection.signal_defects import find_signal_defect
 from servoscope.detection.trace import UNSEEN_EXCESS, Trace
 from servoscope.diagnosis import ml_refit
 from servoscope.diagnosis.batch_estimate import isolation_inputs
 from servoscope.diagnosis.bias_correction import BiasCorrection, corrected_trace, estimate_bias_correction
 from servoscope.diagnosis.checks import what_to_check
-from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.explanation import build_headline, build_reasons, unwatched_changes
-from servoscope.diagnosis.motion_check import motion_warnings
 from servoscope.diagnosis.own_past import examine_by_own_past, own_past_warning
 from servoscope.diagnosis.recording_alarm import RecordingAlarm, first_alarm
 from servoscope.diagnosis.repair import is_repaired, repaired_interval
@@ -38,7 +35,6 @@ from servoscope.diagnosis.result import (
     keep_inputs,
     recording_facts,
 )
-from servoscope.diagnosis.sensor_check import check_sensors
 from servoscope.diagnosis.signal_check import (
     describe_correction,
     judge_both_sides,
@@ -47,15 +43,17 @@ from servoscope.diagnosis.signal_check import (
 )
 from servoscope.diagnosis.timeline import trace_timeline
 from servoscope.diagnosis.warnings import (
-    covariate_warnings,
     detectable_sizes,
     estimate_warnings,
     implausible_warnings,
     power_warnings,
-    warm_up_warnings,
     warning_throughout,
 )
 from servoscope.estimation.frequency_response import response_rows
+from servoscope.evidence.examination import Examination
+from servoscope.evidence.kinds import findings
+from servoscope.evidence.sensors import check_sensors
+from servoscope.evidence.signals import find_signal_defect
 from servoscope.isolation.candidate import UNKNOWN, Candidate
 from servoscope.isolation.isolate import isolate
 from servoscope.signals import MIN_SAMPLES, Recording
@@ -158,18 +156,15 @@ def _judge_signals(
     baseline: Baseline, recording: Recording, progress: Callable[[str], None], point: str | None
 ) -> tuple[Diagnosis, Examination, BiasCorrection | None]:
     points = baseline.per_point if point is None else (baseline.at(point),)
-    recording, sensors = check_sensors(points[0], recording)
+    recording, departed = check_sensors(points[0], recording)
+    sensors = [*map(DiagnosisWarning.of, departed)]
     model = points[0].covariates
     if model is not None and (missing := model.describe_missing(recording.channels)) is not None:
         raise RecordingError(f"{recording.name}: {missing}")
     exams = [Examination.from_recording(one, recording) for one in points]
-    if exams[0].along is not None and (outside := exams[0].along.outside) is not None:
-        return leave_undetermined(exams[0], outside).model_copy(update=_feature_change(exams[0])), exams[0], None
-    hold_s, rate = baseline.loop.monitor.covariate_hold_s, recording.sample_rate
-    if model is not None and (stale := model.describe_stale(recording.channels, hold_s, rate)) is not None:
-        return leave_undetermined(exams[0], stale), exams[0], None
-    if np.ptp(outofcore.extremes(recording.y)) == 0.0:  # without the sensor's noise, which every likelihood divides by
-        return leave_undetermined(exams[0], message("warning.no_motion")), exams[0], None
+    if (unusable := next(findings(exams[0], "undetermined"), None)) is not None:
+        change = _feature_change(exams[0]) if unusable.kind == "outside" else {}
+        return leave_undetermined(exams[0], unusable.text).model_copy(update=change), exams[0], None
     if (own := next(filter(None, map(examine_by_own_past, exams)), None)) is not None and own.alarm.any():
         diagnosis, correction = diagnose_examination(own, progress)
         return _with_warnings(diagnosis, [own_past_warning(own), *sensors]), own, correction
@@ -235,7 +230,7 @@ def diagnose_examination(
         at = alarm.evaluation
         intervals, onset, doubts = _explain_alarm(exam, alarm, progress)
         verdict = "healthy" if is_repaired(exam, intervals) else verdict
-        warnings = _all_warnings(exam, doubts + covariate_warnings(exam, at))
+        warnings = _all_warnings(exam, doubts)
         headline = build_headline(verdict, intervals, {}, warnings, baseline.point)
     elif change := _feature_change(exam):
         headline, intervals, warnings = change["headline"], change["intervals"], _all_warnings(exam, [])
@@ -265,15 +260,15 @@ def diagnose_examination(
 
 def _feature_change(exam: Examination) -> dict[str, Any]:
     """Return what a diagnosis says of features that changed; their limits widen beyond the learned covariates."""
-    features, changed = exam.features, exam.features.changed if exam.features is not None else None
-    if features is None or changed is None:
+    features, change = exam.features, next(findings(exam, "change"), None)
+    if features is None or features.changed is None or change is None:
         return {}
     unknown = (Candidate(name=UNKNOWN, probability=1.0),)
-    interval = FaultInterval(detected_at_s=exam.features_changed_s, probability=1.0, candidates=unknown)
+    interval = FaultInterval(detected_at_s=change.from_s, probability=1.0, candidates=unknown)
     return {
         "verdict": "fault",
-        "headline": features.headline(changed, exam.baseline.point),
-        "reasons": features.reasons(changed, alone=True),
+        "headline": change.text,
+        "reasons": features.reasons(features.changed, alone=True),
         "intervals": (interval,),
     }
 
@@ -289,7 +284,8 @@ def judge_without_alarm(exam: Examination) -> tuple[Verdict, Message, list[Diagn
 
 def _all_warnings(exam: Examination, doubts: Sequence[DiagnosisWarning]) -> list[DiagnosisWarning]:
     defects = [DiagnosisWarning.of(defect) for defect in exam.recording.defects]
-    return [*defects, *estimate_warnings(exam), *motion_warnings(exam), *warm_up_warnings(exam), *doubts]
+    told = [DiagnosisWarning.of(finding) for finding in findings(exam, "doubt")]
+    return [*defects, *told, *estimate_warnings(exam), *doubts]
 
 
 def _explain_alarm(

@@ -12,10 +12,10 @@ from servoscope.core.messages import Message, message
 from servoscope.core.number_format import ratio_digits
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.change_words import change_messages, fault_label
-from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.ml_refit import is_equal_pair
 from servoscope.diagnosis.result import VIBRATION, DiagnosisWarning, FaultInterval, RefitSummary, Verdict
 from servoscope.estimation.filter_bank import nominal_theta
+from servoscope.evidence.examination import Examination
 from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
 from servoscope.models.plants import Plant
 

@@ -17,7 +17,7 @@ from servoscope.core.messages import Message, message
 from servoscope.detection.homogeneity import scatter
 from servoscope.diagnosis.batch_estimate import estimate_batch_deviation, stretch_begin
 from servoscope.diagnosis.diagnose import diagnose_examination
-from servoscope.diagnosis.examine import Examination
+from servoscope.evidence.examination import Examination
 from servoscope.isolation.candidate import UNKNOWN
 from servoscope.isolation.isolate import misfit_limit
 from servoscope.signals import Recording

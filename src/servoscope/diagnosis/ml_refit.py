@@ -11,9 +11,9 @@ import numpy as np
 from servoscope.core.messages import message
 from servoscope.core.number_format import ratio_digits
 from servoscope.detection.onset import Onset
-from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.result import VIBRATION, DiagnosisWarning, FaultInterval, Mimic, RefitSummary
 from servoscope.diagnosis.warnings import warning_throughout
+from servoscope.evidence.examination import Examination
 from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
 from servoscope.models.plants import Fault, Plant
 

@@ -12,8 +12,8 @@ import numpy.typing as npt
 from servoscope.core.arrays import FloatArray
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.diagnosis.diagnose import largest_statistic_ratio
-from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.operating_points import learn
+from servoscope.evidence.examination import Examination
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 from servoscope.signals.readers import as_recording

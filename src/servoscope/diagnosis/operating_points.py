@@ -16,10 +16,10 @@ from servoscope.core.messages import Message, message
 from servoscope.diagnosis import learn_faults
 from servoscope.diagnosis.diagnose import diagnose
 from servoscope.diagnosis.learn_faults import LabelledRecordings
+from servoscope.evidence.population import MIN_MACHINES, Population
 from servoscope.learning import learn as learning
 from servoscope.learning.learn import Progress
 from servoscope.learning.plausibility import check_plausibility, check_wraps
-from servoscope.learning.population import MIN_MACHINES, Population
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 from servoscope.signals.readers import as_recording

@@ -10,9 +10,9 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError
 from servoscope.detection.onset import Onset
 from servoscope.diagnosis.batch_estimate import estimate_batch_deviation
-from servoscope.diagnosis.examine import Examination
 from servoscope.estimation.instrument import InstrumentTuning, instrument_model
 from servoscope.estimation.noise_model import long_run_inflation
+from servoscope.evidence.examination import Examination
 from servoscope.models.lti import LinearSystem
 
 MAX_MEMORIES_BEFORE_ALARM = 6.0  # memories before the alarm, among which the onset is looked for

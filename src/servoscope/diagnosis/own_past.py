@@ -6,8 +6,8 @@ import numpy as np
 
 from servoscope.core.errors import ServoscopeError
 from servoscope.core.messages import message
-from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.result import DiagnosisWarning
+from servoscope.evidence.examination import Examination
 
 SHARE = 1.0 / 3.0  # of the recording that counts as its past
 BUDGET = 0.1  # of the budget of false alarms, which this second test adds to that of the first

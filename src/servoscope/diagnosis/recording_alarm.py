@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from servoscope.detection.onset import Onset, estimate_onset
-from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.output_onset import refine_onset
 from servoscope.diagnosis.pressure_evidence import pressure_onset
+from servoscope.evidence.examination import Examination
 
 
 @dataclass(frozen=True)
@@ -31,8 +29,7 @@ def first_alarm(exam: Examination, progress: Callable[[str], None] = lambda _: N
     crossed = int(exam.estimates.crossed[first]) - 1
     at_once = crossed >= 0 and not exam.baseline.loop.monitor.on_delay
     sample = crossed if at_once else int(exam.estimates.index[first])
-    # the last evaluation has forgotten most of the healthy past; where the alarm has gone, the strongest one
-    at = exam.evaluations - 1 if exam.alarm[-1] else first + int(np.argmax(exam.statistic[first:]))
+    at = exam.explained
     progress("onset")
     if (change := exam.change) is not None and change.repaired:
         began = float(exam.recording.t[0])

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from servoscope.detection.onset import Onset
-from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.ml_refit import refit_candidates, refit_onset, refit_recording, summarise_refit
 from servoscope.diagnosis.result import FaultInterval
+from servoscope.evidence.examination import Examination
 from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
 
 

@@ -6,7 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import computed_field, model_validator
 
@@ -27,6 +27,9 @@ from servoscope.diagnosis.dates import TIMELINES, date_timeline
 from servoscope.isolation.candidate import Candidate, FaultEstimate, ResultModel
 from servoscope.signals import Defect, Recording
 from servoscope.signals.recording import frame_of
+
+if TYPE_CHECKING:  # a result is read without the kernels of an examination
+    from servoscope.evidence.kind import Finding
 
 Verdict = Literal["healthy", "fault", "undetermined"]
 MAX_ALIKE = 3  # defects of one kind that are shown one by one
@@ -121,14 +124,14 @@ class DiagnosisWarning(ResultModel):
         return render(self.description)
 
     @classmethod
-    def of(cls, defect: Defect) -> DiagnosisWarning:
-        """Turn a recording's defect into a warning."""
+    def of(cls, told: Defect | Finding) -> DiagnosisWarning:
+        """Turn a recording's defect, or what evidence doubts, into a warning."""
         return cls(
-            kind=defect.kind,
-            from_s=defect.from_s,
-            to_s=defect.to_s,
-            count=defect.count,
-            description=text_message(defect.message),
+            kind=told.kind,
+            from_s=told.from_s,
+            to_s=told.to_s,
+            count=told.count if isinstance(told, Defect) else told.rows,
+            description=text_message(told.message) if isinstance(told, Defect) else told.text,
         )
 
 

@@ -9,12 +9,12 @@ import numpy as np
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.messages import Message
 from servoscope.detection.louder_noise import LouderNoise
-from servoscope.detection.signal_defects import SignalDefect, begins_wrong, find_corrections
 from servoscope.diagnosis.bias_correction import BiasCorrection
-from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.explanation import undetermined_headline
 from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, recording_facts
 from servoscope.diagnosis.warnings import warning_throughout
+from servoscope.evidence.examination import Examination
+from servoscope.evidence.signals import SignalDefect, begins_wrong, find_corrections
 from servoscope.signals import Recording
 
 # a diagnosis, and what its trace is made of

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from servoscope.detection.onset import Onset
-from servoscope.diagnosis.examine import Examination
 from servoscope.diagnosis.ml_refit import refit_candidates, summarise_refit
 from servoscope.diagnosis.result import FaultInterval
+from servoscope.evidence.examination import Examination
 from servoscope.isolation.candidate import UNKNOWN, Candidate
 
 if TYPE_CHECKING:  # its kernels are loaded after an alarm, not before

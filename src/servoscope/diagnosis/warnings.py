@@ -8,16 +8,14 @@ from servoscope.baseline.plant_fit import MAX_SATURATED_SHARE, saturated_share
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
-from servoscope.detection.signal_defects import find_switched_off
-from servoscope.detection.statistic import noncentrality, required_noncentrality, t2_statistic
-from servoscope.diagnosis.examine import MAX_SKIPPED_SHARE, Examination
+from servoscope.detection.statistic import noncentrality, required_noncentrality
 from servoscope.diagnosis.result import DiagnosisWarning
+from servoscope.evidence.examination import MAX_SKIPPED_SHARE, Examination
+from servoscope.evidence.warm_up import changes_like_warmth
 from servoscope.isolation.candidate import Candidate
 from servoscope.learning.plausibility import negative_coefficients
 
 AT_ONCE = 4096  # evaluations
-COVARIATE_GRID_SIZE = 201  # of a covariate
-MIN_SQUARED_COSINE = 0.95  # squared cosine from which on a change counts as looking like another temperature
 MIN_SKIPPED_SHARE = 0.01  # share of updates without an instrument from which a warning is given
 NO_PROMISE = 10.0  # relative change; a baseline that detects nothing smaller promises nothing
 MAX_DETECTABLE_RATIO = 3.0  # a recording that shows only changes this much larger than promised is called undetermined
@@ -56,30 +54,6 @@ def detectable_sizes(exam: Examination) -> dict[str, tuple[float, float]]:
     return {name: (smallest[name], change) for name, change in promised.items()}
 
 
-def changes_like_warmth(exam: Examination) -> dict[str, float]:
-    """Return, by parameter, the relative change that does nearly what the whole learned warm-up does, if one does."""
-    along, last = exam.along, exam.evaluations - 1
-    if along is None or along.std is None or last < 0:
-        return {}
-    c = along.averages[exam.estimates.index[last]]
-    step = 0.5 * (np.array(along.model.high) - np.array(along.model.low))
-    warmth = (along.model.theta(along.theta, c + 1e-3 * step) - along.model.theta(along.theta, c - 1e-3 * step)) / 2e-3
-    found = {}
-    for name, d in exam.baseline.fault_directions.items():
-        known_d, known_w = np.linalg.solve(exam.covariance(last), np.stack([d, warmth], axis=1)).T
-        if float(d @ known_w) ** 2 >= MIN_SQUARED_COSINE * float(d @ known_d) * float(warmth @ known_w):
-            found[name] = 2.0 * abs(float(d @ known_w)) / float(d @ known_d)
-    return found
-
-
-def warm_up_warnings(exam: Examination) -> list[DiagnosisWarning]:
-    """Return the warning that some changes cannot be told from a temperature that nobody has logged."""
-    if exam.along is None or exam.along.std is None:
-        return []
-    alike = list(changes_like_warmth(exam)) or list(exam.baseline.names)
-    return [warning_throughout(exam, "warm_up", message("warning.warm_up", parameters=alike))]
-
-
 def power_warnings(exam: Examination, detectable: dict[str, tuple[float, float]]) -> list[DiagnosisWarning]:
     """Return warnings about what this recording could not have shown although the baseline promises it."""
     if (share := saturated_share(exam.baseline.loop, exam.recording)) > MAX_SATURATED_SHARE:
@@ -99,42 +73,10 @@ def power_warnings(exam: Examination, detectable: dict[str, tuple[float, float]]
     return [warning_throughout(exam, "power", reason) for reason in reasons]
 
 
-def covariate_warnings(exam: Examination, at: int) -> list[DiagnosisWarning]:
-    """Return warnings that another value of a covariate, within its range, would explain an evaluation as well.
-
-    The value as logged speaks against it: only its sensor can settle what motion cannot tell apart.
-    """
-    along, model = exam.along, exam.along.model if exam.along is not None else None
-    if along is None or model is None:
-        return []
-    logged, found = along.averages[exam.estimates.index[at]], []
-    for j, name in enumerate(model.names):
-        values = np.linspace(model.low[j], model.high[j], COVARIATE_GRID_SIZE)
-        c = np.tile(logged, (len(values), 1))
-        c[:, j] = values
-        expected = exam.expected[at] + model.theta(along.theta, c) - model.theta(along.theta, logged)
-        theta, C = (np.broadcast_to(x, (len(c), *x.shape)) for x in (exam.estimates.theta[at], exam.covariance(at)))
-        T2 = t2_statistic(theta, expected, C)
-        best = int(np.argmin(T2))
-        if T2[best] <= exam.baseline.thresholds.statistic:
-            other, said = float(values[best]), float(logged[j])
-            if along.std is None:
-                text = message("warning.covariate", covariate=name, other=f"{other:.3g}", logged=f"{said:.3g}")
-            else:
-                text = message("warning.warm_up_jump", before=f"{said:.3g}", after=f"{other:.3g}")
-            found.append(text)
-    return [warning_throughout(exam, "point", text) for text in found]
-
-
 def estimate_warnings(exam: Examination) -> list[DiagnosisWarning]:
     """Return warnings about the estimate itself."""
     warnings = []
     e, t = exam.estimates, exam.recording.t
-    if (off := find_switched_off(exam.recording)) is not None:
-        warnings.append(warning_throughout(exam, "signals", off.description))
-    if exam.features is not None and exam.features.unfamiliar:
-        count, spans = exam.features.unfamiliar, exam.features.unfamiliar + len(exam.features.spans)
-        warnings.append(warning_throughout(exam, "features", message("warning.unfamiliar", count=count, spans=spans)))
     if exam.replaced:
         warnings.append(warning_throughout(exam, "instrument", message("warning.instrument_failed")))
     if exam.skipped_share > MIN_SKIPPED_SHARE:

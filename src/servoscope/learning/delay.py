@@ -9,6 +9,7 @@ import numpy as np
 from servoscope.core.errors import RecordingError
 from servoscope.core.messages import Message, message
 from servoscope.estimation.filter_bank import filter_cutoff
+from servoscope.estimation.reference_period import reference_period
 from servoscope.learning.inspection import delay as alignment
 from servoscope.learning.inspection import model_order, residual
 from servoscope.learning.inspection.delay_fit import DelayFit, fit_delay
@@ -93,6 +94,6 @@ def _regression_delay(loop: Loop, recording: Recording, g: model_order.Regressor
     fit = model_order.fit_regression(g.bank.names, g.eta, g.phi, g.ok, block)
     if fit is None:
         return None
-    period = residual.reference_period(recording)
+    period = reference_period(recording)
     _, independent, _ = residual.analyse_residual(recording, fit.v, g.eta, fit.used, block, period)
     return alignment.estimate_delay(recording, g, np.arange(g.bank.n), fit, independent)

@@ -16,9 +16,9 @@ from servoscope.detection.statistic import noncentrality, required_noncentrality
 from servoscope.estimation.filter_bank import filter_cutoff
 from servoscope.estimation.pipeline import Estimates, Pipeline
 from servoscope.estimation.tuning import TuningFit
+from servoscope.evidence.kind import HealthyRecordings
 from servoscope.learning.healthy_plant import PlantKnowledge
 from servoscope.learning.instrument import noise_moments
-from servoscope.learning.recursion import HealthyRecordings
 from servoscope.learning.scatter import HealthyPaths, Scatter, forecast_covariance
 from servoscope.models.loop import Loop
 from servoscope.models.lti import solve_scaled

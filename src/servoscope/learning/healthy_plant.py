@@ -32,8 +32,8 @@ from servoscope.estimation.noise_model import (
     yule_walker,
 )
 from servoscope.estimation.tuning import TuningFit, prefers_white_noise
+from servoscope.evidence.kind import HealthyRecordings
 from servoscope.learning.innovation_fit import FILE_ERROR, fit_innovations
-from servoscope.learning.recursion import HealthyRecordings
 from servoscope.models.plants import Plant
 
 ROUNDING_SHARE = 1e-9  # of the residual's variance: what is left below is rounding

@@ -11,33 +11,30 @@ from servoscope.assessment.assess import assess
 from servoscope.assessment.causes import POOR_CONTROL
 from servoscope.baseline.axis_model import AxisModel, AxisMoves
 from servoscope.baseline.baseline import Baseline
-from servoscope.baseline.feature_model import FeatureModel
-from servoscope.baseline.motion import learn_motion
 from servoscope.baseline.records import BaselineSource, ExactPredictorFit, HealthyScatter, digest
-from servoscope.baseline.sensors import learn_sensors
 from servoscope.core.arrays import to_tuples
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import BaselineError, LoopError, NotEnoughError
 from servoscope.core.messages import Message, message
-from servoscope.detection.signal_defects import find_switched_off
 from servoscope.estimation import estimators
+from servoscope.evidence.features import MIN_RECORDINGS, are_expected
+from servoscope.evidence.kind import HealthyRecordings
+from servoscope.evidence.kinds import learn_evidence
+from servoscope.evidence.population import Population
+from servoscope.evidence.residual import MIN_RECORDINGS as MIN_RECORDINGS_OF_RESIDUAL
+from servoscope.evidence.signals import find_switched_off
 from servoscope.isolation.ml.validity import fit_exact_predictor
 from servoscope.learning.axis_fit import fit_axis
 from servoscope.learning.delay import check_delay
 from servoscope.learning.detectability import learn_detectability
-from servoscope.learning.features import MIN_RECORDINGS, learn_features
 from servoscope.learning.healthy_plant import PlantKnowledge, learn_plant, learn_sequential_test
-from servoscope.learning.population import Population
 from servoscope.learning.pressures import learn_pressures
 from servoscope.learning.recursion import (
-    HealthyRecordings,
     check_signals,
     describe_recursion,
     form_healthy_recordings,
     tune_pipeline,
 )
-from servoscope.learning.residual import MIN_RECORDINGS as MIN_RECORDINGS_OF_RESIDUAL
-from servoscope.learning.residual import learn_residuals
 from servoscope.learning.scatter import follow_recordings, learn_scatter, learn_thresholds, widen_scatter
 from servoscope.models.loop import Loop
 from servoscope.models.plants.axis import AxisPlant
@@ -131,12 +128,6 @@ def _learn_axis(healthy: HealthyRecordings, earlier: Baseline | None) -> tuple[A
     return axis, notes
 
 
-def _learn_features(healthy: HealthyRecordings) -> tuple[FeatureModel | None, list[Message]]:
-    """Features move with a warm-up that is not logged too, and nothing says how."""
-    hidden = healthy.covariates is not None and healthy.covariates.warm_up is not None
-    return (None, []) if hidden else learn_features(healthy.loop, healthy.recordings)
-
-
 def _richer_baseline(earlier: Baseline | None, healthy: HealthyRecordings) -> Baseline | None:
     """Return an earlier baseline that knows the scatter of more recordings than these; None where there is none."""
     own = healthy.pipeline.bank.names
@@ -160,23 +151,13 @@ def _assemble_baseline(
     calibration, hypotheses, test_notes = learn_sequential_test(healthy, plant, scatters)
     axis, axis_notes = _learn_axis(healthy, before)
     scatter = learn_scatter(healthy, plant, None if axis is None else axis.scatter(pipeline.bank.names), before)
-    progress("features")
-    features, feature_notes = _learn_features(healthy)
-    if features is not None and before is not None:
-        features = features.with_scatter(before.features)
-    thresholds = learn_thresholds(healthy, calibration, hypotheses, features is not None)
+    thresholds = learn_thresholds(healthy, calibration, hypotheses, are_expected(loop, recordings))
     progress("promises")
     paths = follow_recordings(healthy, plant, scatter.theta)
     covariance, left_out, transient = widen_scatter(healthy, plant, scatter, paths, thresholds.statistic)
     transient = transient if earlier is not None else 0.0 * transient
     detectability, limits = learn_detectability(healthy, plant, paths, scatter, covariance, transient, thresholds)
-    if before is not None:
-        lacks = (
-            message("learning.carried_features", needed=MIN_RECORDINGS) if before.features and not features else None
-        )
-        known = {"known": before.scatter_from, "own": len(recordings)}
-        limits.append(message("learning.carried", **known, lacks=lacks))
-    notes = [*healthy.notes, *plant.notes, *test_notes, *axis_notes, *scatter.notes, *feature_notes, *limits]
+    notes = [*healthy.notes, *plant.notes, *test_notes, *axis_notes, *scatter.notes, *limits]
     between = to_tuples(scatter.own) if len(recordings) > 1 else ()
     baseline = Baseline(
         loop=loop.to_dict(),
@@ -198,14 +179,13 @@ def _assemble_baseline(
         detectability=detectability,
         delay_s=delay_s,
         notes=tuple(notes),
-        sensors=learn_sensors(loop, recordings),
-        features=features,
-        motion=learn_motion(pipeline, recordings),
         axis=axis,
         covariates=healthy.covariates,
     )
     progress("predictor")
-    return _with_pressures(_with_residuals(_with_exact_predictor(baseline, recordings), healthy), healthy)
+    draft = _with_exact_predictor(baseline, recordings)
+    progress("features")
+    return _with_pressures(_carry_features(learn_evidence(healthy, draft), before), healthy)
 
 
 def _with_pressures(baseline: Baseline, healthy: HealthyRecordings) -> Baseline:
@@ -224,15 +204,14 @@ def _with_pressures(baseline: Baseline, healthy: HealthyRecordings) -> Baseline:
     return baseline.model_copy(update={"pressures": model, "detectability": detectability})
 
 
-def _with_residuals(baseline: Baseline, healthy: HealthyRecordings) -> Baseline:
-    """Learn the residual, unless an exact plant leaves noise alone: the tests of the coefficients know its size.
-
-    That of an axis is scanned for changes sample by sample, and has its own scatter.
-    """
-    exact = baseline.exact is not None and baseline.exact.misfit <= 1.0
-    if exact or baseline.axis is not None or healthy.loop.monitor.hidden_warm_up:
+def _carry_features(baseline: Baseline, before: Baseline | None) -> Baseline:
+    """Return a baseline with the features' scatter of an earlier one, and a note that its scatter counts."""
+    if before is None:
         return baseline
-    return baseline.model_copy(update={"residual": learn_residuals(healthy, np.array(baseline.theta))})
+    features = None if baseline.features is None else baseline.features.with_scatter(before.features)
+    lacks = message("learning.carried_features", needed=MIN_RECORDINGS) if before.features and not features else None
+    carried = message("learning.carried", known=before.scatter_from, own=len(baseline.sources), lacks=lacks)
+    return baseline.model_copy(update={"features": features, "notes": (*baseline.notes, carried)})
 
 
 def _with_exact_predictor(baseline: Baseline, recordings: Sequence[Recording]) -> Baseline:

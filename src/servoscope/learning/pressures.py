@@ -10,8 +10,8 @@ from servoscope.baseline.pressure_model import PressureLayout, PressureModel, Su
 from servoscope.baseline.threshold import score_limit
 from servoscope.core.arrays import to_tuples
 from servoscope.detection.homogeneity import prediction_factor
-from servoscope.learning.recursion import HealthyRecordings
-from servoscope.learning.residual import MIN_RECORDINGS, SHIFT_MARGIN, further_covariance
+from servoscope.evidence.kind import HealthyRecordings
+from servoscope.evidence.residual import MIN_RECORDINGS, SHIFT_MARGIN, further_covariance
 from servoscope.models.plants.cylinder import CHANNELS, CylinderPlant
 
 

@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
-from servoscope.baseline.covariates import CovariateModel
 from servoscope.baseline.plant_fit import MAX_SATURATED_SHARE, can_simulate, saturated_share
 from servoscope.baseline.records import RecursionTuning
 from servoscope.core.arrays import to_tuples
 from servoscope.core.errors import NotEnoughError, RecordingError
 from servoscope.core.messages import Message, message
-from servoscope.detection.signal_defects import describe_misfit, find_signal_defect
 from servoscope.estimation import two_stage
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.pipeline import Pipeline, Regression, Tuning
 from servoscope.estimation.tuning import TuningFit, fit_tuning
-from servoscope.learning.covariates import fit_covariates
+from servoscope.evidence.covariates import fit_covariates
+from servoscope.evidence.kind import HealthyRecordings
+from servoscope.evidence.population import Population
+from servoscope.evidence.signals import describe_misfit, find_signal_defect
+from servoscope.evidence.warm_up import fit_warm_up
 from servoscope.learning.instrument import learn_instrument, learns_instrument
-from servoscope.learning.population import Population
-from servoscope.learning.warm_up import fit_warm_up
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 
@@ -29,20 +29,6 @@ MIN_SAMPLES_PER_COEFFICIENT = 20  # usable samples of every recording
 SPEED_OVER = 0.05  # s over which a speed is measured here
 REST_SPEED_SHARE = 0.02  # of the speed of motion, below which an axis stands still
 MIN_INSTRUMENT_EIGENVALUE = 0.05  # below, the instrument says too little of the regressor to be worth its variance
-
-
-@dataclass(frozen=True, eq=False)
-class HealthyRecordings:
-    """What all steps learn from: m recordings, their regressors, and least squares over them."""
-
-    loop: Loop
-    recordings: Sequence[Recording]
-    pipeline: Pipeline
-    regressions: Sequence[Regression]
-    fit: TuningFit
-    covariates: CovariateModel | None = None
-    population: Population | None = None  # like machines, of which this is one
-    notes: list[Message] = field(default_factory=list)
 
 
 def check_signals(loop: Loop, recording: Recording) -> None:

@@ -16,8 +16,8 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message
 from servoscope.detection import homogeneity
 from servoscope.estimation.pipeline import Estimates
+from servoscope.evidence.kind import HealthyRecordings
 from servoscope.learning.healthy_plant import PlantKnowledge
-from servoscope.learning.recursion import HealthyRecordings
 
 MIN_CERTAIN_STDS = 3.0  # standard deviations from zero from which the scatter of a coefficient is relative
 MIN_NOISE_SHARE = 1e-3  # of a variance, that is not scatter

@@ -13,6 +13,7 @@ from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.core.messages import Message, MessageText, message
 from servoscope.core.short_repr import ShortRepr
 from servoscope.estimation.filter_bank import filter_cutoff
+from servoscope.estimation.reference_period import reference_period
 from servoscope.learning.inspection import delay, excitation, model_order, signals, simulation_fit
 from servoscope.learning.inspection import residual as leftover
 from servoscope.learning.inspection.excitation import FrequencyExcitation, Spectra
@@ -163,7 +164,7 @@ def _measure_with_model(
     recording: Recording, loop: Loop | None, m: InspectionMeasurements
 ) -> tuple[InspectionMeasurements, InspectionTraces]:
     """Add spectra and all that needs a model."""
-    period = leftover.reference_period(recording)
+    period = reference_period(recording)
     spectra = excitation.spectra(recording, period)
     periods = recording.samples / period if period is not None else None
     m = m.model_copy(update={"periods": periods})

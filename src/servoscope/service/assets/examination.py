@@ -24,7 +24,7 @@ from servoscope.service.sources.block import Block
 from servoscope.signals import Recording, clean
 
 if TYPE_CHECKING:  # its kernels are loaded when something is examined
-    from servoscope.diagnosis.examine import Examination
+    from servoscope.evidence.examination import Examination
 
 
 KERNEL_SAMPLES = 400  # that bring all kernels of an examination to work
@@ -107,17 +107,18 @@ def examine_blocks(
         result = examine_blocks(baseline, name, blocks, features, fault, known)
         return result.model_copy(update={"control": _assess_blocks(baseline, name, blocks)})
     from servoscope.diagnosis.diagnose import diagnose_examination, judge_without_alarm
-    from servoscope.diagnosis.examine import Examination
+    from servoscope.evidence.examination import Examination
+    from servoscope.evidence.kinds import findings
 
     try:
         recording, start = blocks_to_recording(baseline, name, blocks)
         exam = Examination.from_recording(baseline, recording, quick=True)
     except ServoscopeError as error:
         return undetermined("unusable", error=str(error))
-    outside, changed = exam.along and exam.along.outside, features is not None and features > 1.0
-    if outside and not changed:
-        return undetermined("unusable", error=outside)
-    if outside or not exam.alarm.any():
+    unusable, changed = next(findings(exam, "undetermined"), None), features is not None and features > 1.0
+    if unusable is not None and not changed:
+        return undetermined("unusable", error=unusable.text)
+    if unusable is not None or not exam.alarm.any():
         if changed:
             headline = message("service.examination.features", excess=features)
             return StoredDiagnosis(verdict="fault", headline=headline, onset=None)

@@ -6,14 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.residual_model import POSITIONS, SPEED_SHARES, ResidualLayout, ResidualModel
 from servoscope.baseline.threshold import score_limit
 from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.detection.homogeneity import prediction_factor
 from servoscope.estimation.pipeline import Pipeline
 from servoscope.estimation.tuning import least_squares
-from servoscope.learning.features import PAST_BUDGET
-from servoscope.learning.recursion import HealthyRecordings
+from servoscope.evidence.features import PAST_BUDGET
+from servoscope.evidence.kind import EvidenceKind, HealthyRecordings, Learned
 from servoscope.signals import Recording
 
 MIN_RECORDINGS = 6  # so that five judge each: fewer do not tell a drift from scatter
@@ -21,6 +22,17 @@ MAX_FOLDS = 8  # of recordings that are left out, some together where there are 
 TOP_SPEED_QUANTILE = 0.99  # of the speed of a recording
 SHIFT_MARGIN = 2.0  # of the limit: differences of halves scatter with heavier tails than features
 ACCELERATION_QUANTILES = (1.0 / 3.0, 2.0 / 3.0)  # braking, neither, accelerating
+
+
+def _learn(healthy: HealthyRecordings, draft: Baseline) -> Learned:
+    """Learn the residual, unless an exact plant leaves noise alone: the tests of the coefficients know its size.
+
+    That of an axis is scanned for changes sample by sample, and has its own scatter.
+    """
+    exact = draft.exact is not None and draft.exact.misfit <= 1.0
+    if exact or draft.axis is not None or healthy.loop.monitor.hidden_warm_up:
+        return None, ()
+    return learn_residuals(healthy, np.array(draft.theta)), ()
 
 
 def learn_residuals(healthy: HealthyRecordings, theta: FloatArray) -> ResidualModel | None:
@@ -90,3 +102,6 @@ def _left_out_ratios(layout: ResidualLayout, healthy: HealthyRecordings) -> Floa
         for i in np.flatnonzero(fold == k).tolist():
             ratios[i] = model.ratios_of(pipeline, recordings[i])
     return ratios
+
+
+RESIDUAL = EvidenceKind("residual", _learn)

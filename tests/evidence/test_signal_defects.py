@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 
 import servoscope as ss
 from servoscope.core.errors import RecordingError
-from servoscope.detection.signal_defects import Correction, begins_wrong, find_signal_defect
+from servoscope.evidence.signals import Correction, begins_wrong, find_signal_defect
 from servoscope.models.loop import Loop
 from servoscope.simulation import FaultEvent, reference, simulate
 

@@ -1,8 +1,8 @@
-"""Healthy recordings -> how the coefficients move with the covariates that were logged beside them."""
+"""How the coefficients of healthy recordings move with logged covariates, and where these leave what was learned."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +10,12 @@ import numpy as np
 from servoscope.baseline.covariates import CovariateModel, CovariatePath
 from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.core.errors import NotEnoughError
+from servoscope.core.messages import message
+from servoscope.detection.statistic import t2_statistic
 from servoscope.estimation.pipeline import Pipeline, Regression
 from servoscope.estimation.tuning import TuningFit, coloured_covariance, fit_tuning, least_squares
+from servoscope.evidence.examination import Examination
+from servoscope.evidence.kind import EvidenceKind, Finding
 from servoscope.signals import Recording
 
 STRETCH = 2.0  # memories over which coefficients count as constant
@@ -21,6 +25,7 @@ MAX_DEGREE = 2
 MIN_PROPORTIONAL_STDS = 10.0
 ROUNDS = 3  # the first finds the noise, in which the covariates had still counted
 MIN_SAMPLES_PER_COEFFICIENT = 20  # usable samples of a stretch
+GRID_SIZE = 201  # values of a covariate that are tried
 
 
 def fit_covariates(
@@ -165,3 +170,44 @@ def at_origin(
         shift = model.theta(theta, np.clip(path.values, model.low, model.high)) - theta
         referred.append(replace(g, eta=g.eta - np.einsum("ki,ki->k", g.phi, shift)))
     return referred
+
+
+def _judge(exam: Examination) -> Iterator[Finding]:
+    """Yield that covariates are outside of what was learned or too old; after an alarm, what else would explain it."""
+    if exam.along is None:
+        return
+    rate, hold_s = exam.recording.sample_rate, exam.baseline.loop.monitor.covariate_hold_s
+    stale = exam.along.model.describe_stale(exam.recording.channels, hold_s, rate)
+    if (outside := exam.along.outside) is not None:
+        yield Finding.throughout(exam, "undetermined", "outside", outside)
+    elif stale is not None:
+        yield Finding.throughout(exam, "undetermined", "signals", stale)
+    elif exam.alarm.any():
+        yield from _doubt_values(exam, exam.along)
+
+
+def _doubt_values(exam: Examination, along: CovariatePath) -> Iterator[Finding]:
+    """Yield that another value of a covariate, within its range, would explain the alarm as well.
+
+    The value as logged speaks against it: only its sensor can settle what motion cannot tell apart.
+    """
+    model, at = along.model, exam.explained
+    logged = along.averages[exam.estimates.index[at]]
+    for j, name in enumerate(model.names):
+        values = np.linspace(model.low[j], model.high[j], GRID_SIZE)
+        c = np.tile(logged, (len(values), 1))
+        c[:, j] = values
+        expected = exam.expected[at] + model.theta(along.theta, c) - model.theta(along.theta, logged)
+        theta, C = (np.broadcast_to(x, (len(c), *x.shape)) for x in (exam.estimates.theta[at], exam.covariance(at)))
+        T2 = t2_statistic(theta, expected, C)
+        best = int(np.argmin(T2))
+        if T2[best] <= exam.baseline.thresholds.statistic:
+            other, said = float(values[best]), float(logged[j])
+            if along.std is None:
+                text = message("warning.covariate", covariate=name, other=f"{other:.3g}", logged=f"{said:.3g}")
+            else:
+                text = message("warning.warm_up_jump", before=f"{said:.3g}", after=f"{other:.3g}")
+            yield Finding.throughout(exam, "doubt", "point", text)
+
+
+COVARIATES = EvidenceKind("covariates", judge=_judge)

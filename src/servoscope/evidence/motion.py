@@ -2,34 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
-from servoscope.baseline.motion import QUANTITIES
+from servoscope.baseline.motion import QUANTITIES, learn_motion
 from servoscope.baseline.plant_fit import share_at_limits
+from servoscope.core import outofcore
 from servoscope.core.messages import Message, message
 from servoscope.detection.trace import UNSEEN_EXCESS
-from servoscope.diagnosis.examine import Examination
-from servoscope.diagnosis.result import DiagnosisWarning
-from servoscope.diagnosis.warnings import warning_throughout
+from servoscope.evidence.examination import Examination
+from servoscope.evidence.kind import EvidenceKind, Finding
 
 MIN_SATURATED_SHARE = 0.05  # share of the samples with u at a limit that is worth telling
 
 
-def motion_warnings(exam: Examination) -> list[DiagnosisWarning]:
-    """Return a warning where an alarm came under a motion never seen, or one was withheld for it."""
-    if not exam.apparent_alarm.any() or exam.baseline.extrapolates:
-        return []
-    if exam.motion is None:
-        return [warning_throughout(exam, "motion", message("warning.motion_not_stored"))]
+def _judge(exam: Examination) -> Iterator[Finding]:
+    """Yield that y never moves, that an alarm came under a motion never seen, or that one was withheld for it."""
+    if np.ptp(outofcore.extremes(exam.recording.y)) == 0.0:  # without the noise that every likelihood divides by
+        yield Finding.throughout(exam, "undetermined", "motion", message("warning.no_motion"))
+    elif not exam.apparent_alarm.any() or exam.baseline.extrapolates:
+        return
+    elif exam.motion is None:
+        yield Finding.throughout(exam, "doubt", "motion", message("warning.motion_not_stored"))
+    else:
+        yield from _doubt_motion(exam)
+
+
+def _doubt_motion(exam: Examination) -> Iterator[Finding]:
     alarm = exam.alarm if exam.alarm.any() else exam.apparent_alarm
     ratio = np.where(alarm, np.maximum(exam.statistic / exam.baseline.thresholds.statistic, exam.estimates.level), -1.0)
     at = int(np.argmax(ratio))
     withheld = not exam.alarm.any()
     if not withheld and exam.motion_excess(slice(at, at + 1))[0] < UNSEEN_EXCESS:
-        return []
+        return
     values = {"quantities": _describe_quantities(exam, at), "saturated": _describe_saturation(exam)}
     key = "warning.motion_withheld" if withheld else "warning.motion_unseen"
-    return [warning_throughout(exam, "motion", message(key, **values))]
+    yield Finding.throughout(exam, "doubt", "motion", message(key, **values))
 
 
 def _describe_quantities(exam: Examination, at: int) -> tuple[Message, ...]:
@@ -59,3 +68,6 @@ def _describe_quantities(exam: Examination, at: int) -> tuple[Message, ...]:
 def _describe_saturation(exam: Examination) -> Message | None:
     share = share_at_limits(exam.baseline.loop, exam.recording)
     return message("motion.saturated", share=share) if share > MIN_SATURATED_SHARE else None
+
+
+MOTION = EvidenceKind("motion", lambda healthy, _: (learn_motion(healthy.pipeline, healthy.recordings), ()), _judge)

@@ -24,21 +24,20 @@ from servoscope.core import outofcore
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import RecordingError
 from servoscope.detection import cusum_design
-from servoscope.detection.baseline_run import BaselineRun, baseline_run, cusum_constants
+from servoscope.detection.baseline_run import BaselineRun, baseline_run, cusum_constants, has_failed_instrument
+from servoscope.detection.feature_evidence import FeatureEvidence
 from servoscope.detection.louder_noise import noise_growth
 from servoscope.detection.statistic import apply_alarm_delays, t2_statistic
 from servoscope.detection.trace import UNSEEN_EXCESS, Statistic, any_exceeded, detection_statistics
 from servoscope.detection.warm_up import follow_warm_up
-from servoscope.diagnosis.feature_evidence import FeatureEvidence
 from servoscope.estimation.noise_model import WhiteNoise
-from servoscope.estimation.pipeline import Estimates, EstimationRunner, Pipeline, RegressionRunner, Tuning
+from servoscope.estimation.pipeline import Estimates, EstimationRunner, Pipeline, Tuning
 from servoscope.isolation.ml.axis_scan import AxisChange
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 from servoscope.simulation.stability import settling_samples
 
 MAX_SKIPPED_SHARE = 0.2  # share of updates that an estimator's guard may skip before the AKF takes over
-MIN_INSTRUMENT_EIGENVALUE = 0.05  # of 1; below, the recursion follows too slowly, and below 0 it runs away
 FALL_BACK = {"estimator": "akf"}
 MAX_COVARIATE_T2 = 1.0  # T^2 of what covariates do within a recording, from which on no single plant explains it
 AT_ONCE = 4096  # evaluations
@@ -95,7 +94,8 @@ class Examination:
             baseline = baseline.model_copy(update=followed)
         exam = _run_quickly(baseline, recording) if quick and along is None else None
         exam = exam or _run_recursion(baseline, recording, pipeline, along)
-        skipped, replaced = exam.estimates.skipped_share, _has_failed_instrument(exam)
+        skipped, own = exam.estimates.skipped_share, baseline.recursion.instrument is not None
+        replaced = not own and has_failed_instrument(exam.pipeline, exam.tuning, recording)
         if replaced or skipped > MAX_SKIPPED_SHARE:
             other = loop.model_copy(update={"monitor": loop.monitor.model_copy(update=FALL_BACK)})
             pipeline = Pipeline.of(other, baseline.recursion.stage_one, baseline.recursion.still_speed)
@@ -188,7 +188,17 @@ class Examination:
         if (change := self.apparent_change) is None:
             return None
         at = min(int(np.searchsorted(self.estimates.index, change.detected)), self.evaluations - 1)
-        return None if (self.motion_excess(slice(at, at + 1)) >= UNSEEN_EXCESS).any() else change
+        unseen, told = self.motion_excess(slice(at, at + 1)) >= UNSEEN_EXCESS, self._told[self._changed(change)]
+        return None if unseen.any() and 2 * told.sum() <= len(told) else change  # one that lasts is told mostly
+
+    @cached_property
+    def _told(self) -> BoolArray:
+        """Where an axis, whose terms are those of physics, is off by more than its extrapolation is, shape (K,)."""
+        told, e = np.zeros(self.evaluations, dtype=np.bool_), self.estimates
+        if self.motion is not None and self.baseline.axis is not None:
+            for at in outofcore.iter_chunks(0, self.evaluations, e.theta, e.S, at_once=AT_ONCE):
+                told[at] = self.motion.tells(e.theta[at] - self.expected[at], self.covariance(at), at)
+        return told
 
     def _changed(self, change: AxisChange | None) -> BoolArray:
         """Return whether a change within the recording had been detected, or was not yet repaired, shape (K,)."""
@@ -212,9 +222,20 @@ class Examination:
             T2 = np.where(self.ready[at], t2_statistic(e.theta[at], self.expected[at], C), 0.0)
             # the sequential test knows no model error
             exceeded[at] = (limit < T2) | ((e.level[at] >= 1.0) & (self.motion_excess(at) < UNSEEN_EXCESS))
-        exceeded &= any_exceeded(self.statistics[:2])
+        exceeded = (exceeded | self._told) & any_exceeded(self.statistics[:2])
         self.release()
         return self._changed(self.change) | apply_alarm_delays(exceeded, *self.pipeline.delays)
+
+    @property
+    def explained(self) -> int:
+        """The evaluation that an explanation is about; the last one has forgotten most of the healthy past.
+
+        Where an alarm has gone, the one after its beginning at which T^2 is largest.
+        """
+        if not self.alarm.any() or self.alarm[-1]:
+            return self.evaluations - 1
+        first = int(self.alarm.argmax())
+        return first + int(np.argmax(self.statistic[first:]))
 
     @cached_property
     def motion(self) -> RecordedMotion | None:
@@ -370,22 +391,3 @@ def _run_recursion(
     arrays = {name: column.to_array() for name, column in columns.items()}
     expected, T2 = arrays.pop("expected"), arrays.pop("statistic")
     return Examination(baseline, recording, pipeline, tuning, Estimates(**arrays), noise, expected, T2, 0.0, growth)
-
-
-def _has_failed_instrument(exam: Examination) -> bool:
-    """Return whether the instrument of the nominal loop tells nothing of this recording's motion, or the contrary.
-
-    The mean of theta moves by -E[z z']^-1 E[z phi'] theta/N: its eigenvalues tell where it goes. Coefficients that an
-    instrument has been learned for are not those of the AKF, which therefore cannot take over there.
-    """
-    if exam.baseline.recursion.instrument is not None or not exam.pipeline.bank.has_instrument:
-        return False
-    recording, runner, scale = exam.recording, RegressionRunner(exam.pipeline), exam.tuning.scale
-    own = shared = np.zeros((len(scale), len(scale)))
-    for rows in outofcore.iter_chunks(0, recording.samples):
-        part = recording.rows(rows)
-        g = runner.advance(part.r, part.u, part.y, part.restart)
-        z, phi = g.z[g.ok] / scale, g.phi[g.ok] / scale
-        own, shared = own + z.T @ z, shared + z.T @ phi
-    moved = np.linalg.lstsq(own, shared, rcond=None)[0]
-    return bool(own.any() and np.linalg.eigvals(moved).real.min() < MIN_INSTRUMENT_EIGENVALUE)

@@ -10,7 +10,7 @@ import pytest
 import servoscope as ss
 from servoscope.baseline.records import HealthyScatter
 from servoscope.core.errors import BaselineError
-from servoscope.learning.population import NormalPrior, Population
+from servoscope.evidence.population import NormalPrior, Population
 from servoscope.simulation import reference, simulate
 from servoscope.simulation.tutorial import AXIS, motion
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from operator import itemgetter
 
 import numpy as np
@@ -21,8 +21,10 @@ from servoscope.baseline.threshold import NARROW_PRIOR, WIDE_PRIOR, robust_limit
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.core.messages import Message, message
+from servoscope.estimation.reference_period import reference_period
 from servoscope.estimation.window_features import SPEED_TIME, FeatureLayout, Window, WindowFeatures
-from servoscope.learning.inspection.residual import reference_period
+from servoscope.evidence.examination import Examination
+from servoscope.evidence.kind import EvidenceKind, Finding
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 
@@ -44,11 +46,32 @@ SILENT_BAND_SHARE = 1e-9  # share of a signal's power below which a band is sile
 REPEATS = 0.02  # of the variance: the reference repeats where its difference after a period stays below
 
 
+def are_expected(loop: Loop, recordings: Sequence[Recording]) -> bool:
+    """Return whether recordings have features to learn: then these take their part of the budget of false alarms.
+
+    Features move with a warm-up that is not logged too, and nothing says how.
+    """
+    enough = len(recordings) >= MIN_RECORDINGS + len(loop.columns.covariates)
+    return bool(loop.monitor.feature_false_alarms) and enough and not loop.monitor.hidden_warm_up
+
+
+def _judge(exam: Examination) -> Iterator[Finding]:
+    """Yield a change of the features beside healthy coefficients, and spans that no healthy recording is like."""
+    evidence = exam.features
+    if evidence is not None and evidence.unfamiliar:
+        count, spans = evidence.unfamiliar, evidence.unfamiliar + len(evidence.spans)
+        text = message("warning.unfamiliar", count=count, spans=spans)
+        yield Finding.throughout(exam, "doubt", "features", text)
+    if evidence is not None and evidence.changed is not None and exam.features_changed_s is not None:
+        text, since = evidence.headline(evidence.changed, exam.baseline.point), exam.features_changed_s
+        yield Finding("change", "features", text, since, float(exam.recording.t[-1]))
+
+
 def learn_features(loop: Loop, recordings: Sequence[Recording]) -> tuple[FeatureModel | None, list[Message]]:
     """Learn the features of healthy recordings; None where there are too few recordings, or too short ones."""
-    share = loop.monitor.feature_false_alarms
-    if not share or len(recordings) < MIN_RECORDINGS + len(loop.columns.covariates):
+    if not are_expected(loop, recordings):
         return None, []
+    share = loop.monitor.feature_false_alarms
     layout = choose_layout(loop, recordings)
     runner = WindowFeatures(layout)
     windows = [_windows(runner, recording) for recording in recordings]
@@ -196,3 +219,6 @@ def _period_of(recording: Recording) -> int:
     if len(lengths) > 1:
         return 0
     return reference_period(recording.rows(slice(0, MAX_PERIOD_SEARCH_SAMPLES)), 0.5 * REPEATS) or 0
+
+
+FEATURES = EvidenceKind("features", lambda healthy, _: learn_features(healthy.loop, healthy.recordings), _judge)

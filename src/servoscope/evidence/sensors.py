@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from servoscope.baseline.baseline import Baseline
-from servoscope.baseline.sensors import find_sensor_deviation, without_sensor
-from servoscope.diagnosis.result import DiagnosisWarning
+from servoscope.baseline.sensors import find_sensor_deviation, learn_sensors, without_sensor
+from servoscope.evidence.kind import EvidenceKind, Finding
 from servoscope.signals import Recording
 
 # times the residual power of the other sensor, from which the plant says that a sensor is wrong
@@ -18,8 +18,8 @@ MAX_MEMORIES_AFTER_ONSET = 20.0  # memories after the onset that are asked
 MIN_SAMPLES = 20  # usable samples
 
 
-def check_sensors(baseline: Baseline, recording: Recording) -> tuple[Recording, list[DiagnosisWarning]]:
-    """Return a recording without the sensor that departs from the others, and a warning that names it.
+def check_sensors(baseline: Baseline, recording: Recording) -> tuple[Recording, list[Finding]]:
+    """Return a recording without the sensor that departs from the others, and a doubt that names it.
 
     Where it cannot be told which of two it is, or only its noise has grown, the recording stays as it is.
     """
@@ -31,11 +31,11 @@ def check_sensors(baseline: Baseline, recording: Recording) -> tuple[Recording, 
         return recording, []
     from_s, to_s = float(recording.t[sensor_deviation.onset]), float(recording.t[-1])
     count = recording.samples - sensor_deviation.onset
-    warning = DiagnosisWarning(kind="sensor", from_s=from_s, to_s=to_s, count=count, description=sensor_deviation.text)
+    doubt = Finding("doubt", "sensor", sensor_deviation.text, from_s, to_s, count)
     if len(sensor_deviation.names) == 1 and sensor_deviation.kind != "noise":
         y = without_sensor(recording, model.names, sensor_deviation.names[0], sensor_deviation.onset)
         recording = replace(recording, y=y)
-    return recording, [warning]
+    return recording, [doubt]
 
 
 def wrong_sensor(baseline: Baseline, recording: Recording, onset: int) -> int | None:
@@ -67,3 +67,6 @@ def _residual_power(baseline: Baseline, rows: Recording, y: np.ndarray[tuple[int
         return 0.0
     residual = regression.eta - regression.phi @ np.array(baseline.theta)
     return float(np.mean(residual[regression.ok] ** 2))
+
+
+SENSORS = EvidenceKind("sensors", lambda healthy, _: (learn_sensors(healthy.loop, healthy.recordings), ()))

@@ -10,7 +10,7 @@ import pytest
 
 import servoscope as ss
 from servoscope.baseline.residual_model import CLASSES, FADE_S, SIZE, ResidualLayout, ResidualModel
-from servoscope.diagnosis.examine import Examination
+from servoscope.evidence.examination import Examination
 from servoscope.signals import Recording
 from servoscope.simulation import CylinderRig, FaultEvent, cylinder_motion, simulate_cylinder
 

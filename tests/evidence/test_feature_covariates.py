@@ -11,8 +11,8 @@ from axis_logs import LOOP, axis
 
 import servoscope as ss
 from servoscope.core.errors import RecordingError
-from servoscope.diagnosis.feature_evidence import FeatureEvidence
-from servoscope.learning.features import learn_features
+from servoscope.detection.feature_evidence import FeatureEvidence
+from servoscope.evidence.features import learn_features
 
 WARM_LOOP = ss.Loop.from_dict(LOOP.to_dict() | {"columns": {"covariates": {"oil": "oil"}}})
 

@@ -19,7 +19,7 @@ from servoscope.detection.baseline_run import baseline_run
 from servoscope.detection.cusum_design import sure_level, worst_case_hypotheses
 from servoscope.detection.statistic import whiten
 from servoscope.diagnosis.diagnose import diagnose_examination
-from servoscope.diagnosis.examine import Examination
+from servoscope.evidence.examination import Examination
 from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Loop
 from servoscope.service.assets.examination import StoredDiagnosis, blocks_to_recording, examine_blocks, undetermined

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from accuracy.axis import AXES, RATE, loop, moves, random_motion, record
 import servoscope as ss
 from servoscope.baseline.motion import WINDOWS, RecordedMotion, motion_excess
 from servoscope.core.errors import BaselineError, RecordingError
-from servoscope.diagnosis.examine import Examination
+from servoscope.evidence.examination import Examination
 from servoscope.service.assets.examination import examine_blocks
 from servoscope.service.sources.block import Block
 from servoscope.signals import Recording
@@ -189,6 +190,30 @@ def test_the_onset_is_dated_where_the_residual_is_no_noise(name: str) -> None:
     assert len(seen) >= 5 and inside >= len(seen) - 1
     assert np.median([abs(run["onset"][1] - run["begin"]) for run in seen]) < 0.3
     assert all(len(row) == len(onset.TABLES[1].columns) for row in onset.covered_on_axis(name, found))
+
+
+@functools.cache
+def terms() -> ss.Baseline:
+    """Return the baseline of an axis with Stribeck friction as a list of terms, which has a refit."""
+    settings = loop().to_dict() | {"plant": {"kind": "axis", "terms": ["viscous", "coulomb", "offset"]}}
+    recordings = [record(AXES["stribeck"], moves(seed, seconds=30.0), seed) for seed in range(4)]
+    return ss.learn(ss.Loop.from_dict(settings), recordings)
+
+
+@pytest.mark.parametrize(("time", "coulomb", "verdict"), [(2.0, 2.0, "fault"), (4.0, 2.0, "fault"), (4.0, 1.0, "")])
+def test_an_axis_is_faulty_beyond_the_error_of_its_extrapolation(time: float, coulomb: float, verdict: str) -> None:
+    """At half and a quarter of the learned speed: twice the friction is a fault, Stribeck friction is none."""
+    axis = replace(AXES["stribeck"], coulomb=coulomb * AXES["stribeck"].coulomb)
+    seeds = (11,) if verdict else (11, 12)
+    for seed in seeds:
+        recording = record(axis, moves(seed, time=time, seconds=30.0), seed)
+        assert Examination.from_recording(terms(), recording).motion_excess(slice(None)).max() > 0.5
+        diagnosis = ss.diagnose(terms(), recording)
+        if verdict:
+            assert diagnosis.verdict == "fault"
+            assert any(warning.kind == "motion" for warning in diagnosis.warnings)
+        else:
+            assert diagnosis.verdict != "fault"
 
 
 class TestMonitorWithMotionCheck:

@@ -28,7 +28,7 @@ from servoscope.detection.feature_monitor import hold, smallest_in_a_row
 from servoscope.detection.homogeneity import leave_one_out, scatter, scatter_of_others
 from servoscope.detection.statistic import t2_statistic
 from servoscope.estimation.window_features import FeatureLayout, Window, WindowFeatures
-from servoscope.learning.features import choose_layout, learn_features
+from servoscope.evidence.features import choose_layout, learn_features
 from servoscope.service.assets.asset import Asset
 from servoscope.service.assets.checkpoint import pack_state
 from servoscope.service.assets.examination import examine_blocks

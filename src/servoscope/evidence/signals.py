@@ -12,6 +12,8 @@ from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray, IntArray
 from servoscope.core.messages import Message, message
 from servoscope.estimation.pipeline import Pipeline
+from servoscope.evidence.examination import Examination
+from servoscope.evidence.kind import EvidenceKind, Finding
 from servoscope.signals import Recording
 from servoscope.signals.quality import QualityFinding, QualitySettings, check_block, init_state
 
@@ -283,3 +285,11 @@ def _find_jump(rows: Recording, first: int, lead: int) -> SignalDefect | None:
     begin = int(jumps[0]) + 1
     text = message("signals.jump", t=float(rows.t[begin]), size=size)
     return SignalDefect(first + begin, text)
+
+
+def _judge(exam: Examination) -> Iterator[Finding]:
+    if (off := find_switched_off(exam.recording)) is not None:
+        yield Finding.throughout(exam, "doubt", "signals", off.description)
+
+
+DEFECTS = EvidenceKind("", judge=_judge)

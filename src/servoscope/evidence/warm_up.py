@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,16 +10,20 @@ import numpy as np
 from servoscope.baseline.covariates import CovariateModel, WarmUp
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import NotEnoughError
+from servoscope.core.messages import message
 from servoscope.detection.warm_up import BLOCK_MEMORIES, NAME, BlockSums, WarmUpFit, fit_course
 from servoscope.estimation.pipeline import Pipeline, Regression
 from servoscope.estimation.tuning import TuningFit
-from servoscope.learning.covariates import MIN_PROPORTIONAL_STDS, STRETCH, refer_to_covariates
+from servoscope.evidence.covariates import MIN_PROPORTIONAL_STDS, STRETCH, refer_to_covariates
+from servoscope.evidence.examination import Examination
+from servoscope.evidence.kind import EvidenceKind, Finding
 from servoscope.models.lti import solve_scaled
 from servoscope.signals import Recording
 
 TIME_CONSTANT_GRID_SIZE = 16  # time constants before the best is refined
 MAX_DURATIONS = 20.0  # durations of a recording
 ROUNDS = 2  # courses make a model of the coefficients, which makes better courses
+MIN_SQUARED_COSINE = 0.95  # squared cosine from which on a change counts as looking like another temperature
 MIN_WARMING_STDS = 5.0  # standard deviations by which the warmest recording has to warm
 
 
@@ -126,3 +130,29 @@ def _variance(sums: Sequence[BlockSums], courses: Sequence[WarmUpFit]) -> float:
         for block_sums, fit in zip(sums, courses, strict=True)
     ]
     return float(np.mean(each))
+
+
+def changes_like_warmth(exam: Examination) -> dict[str, float]:
+    """Return, by parameter, the relative change that does nearly what the whole learned warm-up does, if one does."""
+    along, last = exam.along, exam.evaluations - 1
+    if along is None or along.std is None or last < 0:
+        return {}
+    c = along.averages[exam.estimates.index[last]]
+    step = 0.5 * (np.array(along.model.high) - np.array(along.model.low))
+    warmth = (along.model.theta(along.theta, c + 1e-3 * step) - along.model.theta(along.theta, c - 1e-3 * step)) / 2e-3
+    found = {}
+    for name, d in exam.baseline.fault_directions.items():
+        known_d, known_w = np.linalg.solve(exam.covariance(last), np.stack([d, warmth], axis=1)).T
+        if float(d @ known_w) ** 2 >= MIN_SQUARED_COSINE * float(d @ known_d) * float(warmth @ known_w):
+            found[name] = 2.0 * abs(float(d @ known_w)) / float(d @ known_d)
+    return found
+
+
+def _judge(exam: Examination) -> Iterator[Finding]:
+    """Yield that some changes cannot be told from a temperature that nobody has logged."""
+    if exam.along is not None and exam.along.std is not None:
+        alike = list(changes_like_warmth(exam)) or list(exam.baseline.names)
+        yield Finding.throughout(exam, "doubt", "warm_up", message("warning.warm_up", parameters=alike))
+
+
+WARM_UP = EvidenceKind("covariates", judge=_judge)
