@@ -20,7 +20,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import LoopError
 from servoscope.core.jit import sine
 from servoscope.estimation.axis_filter import AxisFilter, AxisNoise, AxisSignals
-from servoscope.isolation.ml.axis_scan import EDGE_SHARE, FALSE_ALARMS, MIN_END_SHARE, find_axis_change, scan_limit
+from servoscope.isolation.ml.axis_scan import FALSE_ALARMS, MIN_EDGE_SHARE, find_axis_change, scan_limit
 from servoscope.isolation.ml.axis_vibration import find_vibration
 from servoscope.isolation.ml.axis_window import AxisWindow
 from servoscope.isolation.ml.hypothesis import fit_hypothesis
@@ -157,7 +157,7 @@ class TestWindow:
         e = rng.normal(size=(tries, N))
         S, t = np.cumsum(e, axis=1), np.arange(1, N + 1) / N
         bridge = (S - t * S[:, -1:]) / np.sqrt(N)
-        inside = (t >= EDGE_SHARE) & (t <= 1.0 - MIN_END_SHARE)
+        inside = (t >= MIN_EDGE_SHARE) & (t <= 1.0 - MIN_EDGE_SHARE)
         largest = (bridge[:, inside] ** 2 / (t * (1.0 - t))[inside]).max(axis=1)
         share = float((largest > scan_limit(1, 0.01)).mean())
         assert 0.005 < share < 0.013  # discrete steps miss a little of the continuous path

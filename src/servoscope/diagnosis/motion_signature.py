@@ -15,9 +15,9 @@ from servoscope.signals import Recording
 BINS = 40  # of position and of speed
 MIN_SAMPLES_PER_BIN = 5  # samples that a bin needs
 SLOW_SPEED_SHARE = 0.02  # of the fast speeds (99th percentile), below which direction means nothing
-MAX_ROWS = 50_000  # that are looked at, the newest
+MAX_MEMORIES = 100.0  # of the estimator, the newest, that are looked at: minutes, whatever the rate
 WINDOW = 0.5  # periods of the cutoff over which a parabola is fitted to the signals
-MIN_MOTION_SAMPLES = 200  # samples in motion
+MIN_MOTION_PERIODS = 20.0  # periods of the cutoff in motion
 
 
 class SignatureWidth(NamedTuple):
@@ -46,7 +46,8 @@ class MotionSignature(NamedTuple):
 def motion_signature(recording: Recording, loop: Loop, from_s: float, to_s: float) -> MotionSignature | None:
     """Return the signature of the rows with from_s <= t < to_s; None if they hold too little motion both ways."""
     first, end = np.searchsorted(recording.t, [from_s, to_s])
-    rows = recording[max(int(first), int(end) - MAX_ROWS) : int(end)]
+    newest = int(end) - round(MAX_MEMORIES * loop.monitor.memory * loop.sample_rate)
+    rows = recording[max(int(first), newest) : int(end)]
     window = 2 * max(2, round(0.5 * WINDOW * loop.sample_rate / loop.cutoff)) + 1
     if rows.samples < 2 * window:
         return None
@@ -60,7 +61,8 @@ def motion_signature(recording: Recording, loop: Loop, from_s: float, to_s: floa
         return None
     fast = float(np.quantile(np.abs(v[known]), 0.99))
     moving = known & (np.abs(v) > SLOW_SPEED_SHARE * fast)
-    if min((moving & (v > 0.0)).sum(), (moving & (v < 0.0)).sum()) < MIN_MOTION_SAMPLES / 2:
+    least = 0.5 * MIN_MOTION_PERIODS * loop.sample_rate / loop.cutoff
+    if min((moving & (v > 0.0)).sum(), (moving & (v < 0.0)).sum()) < least:
         return None
     position = _bin_edges(y[moving])
     speeds = np.linspace(-fast, fast, BINS + 1)

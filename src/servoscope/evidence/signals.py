@@ -33,7 +33,8 @@ MAX_JUMP_SHARE = 0.1  # share of the samples
 MIN_STEP_RATIO = 2.0  # times smaller are all other steps of y, and those of r at that time
 LEAD_S = 0.2  # beyond the delay from u to y that r may step before y does: drives on a bus answer 0.06 s late [s],
 MIN_LEAD_SAMPLES = 3  # or, where that is longer, so many samples
-MAX_ROWS = 50_000  # that the residual is computed from
+MAX_MEMORIES = 100.0  # of the estimator, from the beginning, that the residual is computed from: minutes
+MAX_ROWS = 1_000_000  # of them, for the memory that they take
 BEGINNING_SHARE = 0.25  # of the rows in motion: what a log has wrong, a unit or a sign, it has wrong there too
 MIN_WRONG_SHARE, MAX_RIGHT_SHARE = (
     0.1,
@@ -126,7 +127,7 @@ def find_corrections(
     which are alike to a linear plant. None yields both. In a tight loop r and y are nearly alike, and exchanging them
     makes the residual few times smaller: where it comes down to the healthy one, that is enough.
     """
-    rows = recording.rows(slice(0, MAX_ROWS))
+    rows = _beginning(pipeline, recording)
 
     def residual(correction: Correction) -> tuple[float, float]:
         return _residual_share(pipeline, theta, correction.apply(rows))
@@ -159,7 +160,7 @@ def begins_wrong(pipeline: Pipeline, theta: FloatArray, recording: Recording, co
     """Return whether a correction explains the first motion of a recording better, too; a fault may begin later."""
     if correction.factors[1:] == (1.0, 1.0) and correction.order == (0, 1, 2):
         return True  # r in another unit, which the plant does not notice
-    rows = recording.rows(slice(0, MAX_ROWS))
+    rows = _beginning(pipeline, recording)
     found = correction.apply(rows)
     before, _ = _residual_share(pipeline, theta, rows, BEGINNING_SHARE)
     after, _ = _residual_share(pipeline, theta, found, BEGINNING_SHARE)
@@ -171,7 +172,7 @@ def describe_misfit(pipeline: Pipeline, theta: FloatArray, recording: Recording)
 
     For plants that are known roughly, as before learning.
     """
-    rows = recording.rows(slice(0, MAX_ROWS))
+    rows = _beginning(pipeline, recording)
     if not _residual_share(pipeline, theta, rows)[0] > MIN_WRONG_SHARE:
         return None
     corrections = [
@@ -184,6 +185,10 @@ def describe_misfit(pipeline: Pipeline, theta: FloatArray, recording: Recording)
     if of_u and of_y and of_y[0].factors[0] != 1.0:  # r agrees with y, so that both or u may be wrong
         return message("signals.unit_of_either", u=of_u[0].factors[1], y=of_y[0].factors[2])
     return (of_y or corrections)[0].description if corrections else None
+
+
+def _beginning(pipeline: Pipeline, recording: Recording) -> Recording:
+    return recording.rows(slice(0, min(round(MAX_MEMORIES * pipeline.memory_samples), MAX_ROWS)))
 
 
 def _single_corrections() -> Iterator[Correction]:

@@ -21,9 +21,8 @@ from servoscope.models.plants.axis import AxisPlant
 from servoscope.signals import Recording
 
 FALSE_ALARMS = 1e-4  # share of healthy recordings that are called changed
-EDGE_SHARE = 0.05  # of a stretch, in which no onset is looked for at its beginning, and at most at its end
-MIN_END_SHARE = 0.01  # and at least at its end
-END_S = 2.0 * LONG_RUN_S  # of motion that a change at the end has: scores hang together for half of that
+EDGE_S = 2.0 * LONG_RUN_S  # of motion before a change and with it: scores hang together for half of that
+MIN_EDGE_SHARE, MAX_EDGE_SHARE = 0.01, 0.05  # of the motion of a stretch, at least and at most for that
 MAX_ONSETS = 400  # that are tried
 MAX_SAMPLES = 40_000  # samples of a stretch
 DETECTION_SAMPLES = 4  # of the window, within which the time of a detection is found
@@ -120,7 +119,7 @@ def scan_limit(faults: int, false_alarms: float = FALSE_ALARMS) -> float:
     1 - t (James, James and Siegmund, 1987), times the number of faults.
     """
     x = np.linspace(5.0, 60.0, 2000)
-    range_ = sum(np.log((1.0 - edge) / edge) for edge in (EDGE_SHARE, MIN_END_SHARE))
+    range_ = 2.0 * np.log((1.0 - MIN_EDGE_SHARE) / MIN_EDGE_SHARE)
     probability = faults * np.sqrt(x / (2.0 * np.pi)) * np.exp(-x / 2.0) * (range_ * (1.0 - 1.0 / x) + 2.0 / x)
     return float(x[np.argmax(probability <= false_alarms)])
 
@@ -168,8 +167,8 @@ def _likeliest_change(window: AxisWindow, faults: tuple[Fault, ...]) -> _ChangeF
     healthy = fit_hypothesis(window, [], never, np.zeros(m), [np.zeros(0)], free=True)
     moving = np.cumsum(window.counted)
     share = moving / max(moving[-1], 1)
-    end = float(np.clip(END_S * window.sample_rate / max(moving[-1], 1), MIN_END_SHARE, EDGE_SHARE))
-    inside = np.flatnonzero((share >= EDGE_SHARE) & (share <= 1.0 - end) & window.counted)
+    edge = float(np.clip(EDGE_S * window.sample_rate / max(moving[-1], 1), MIN_EDGE_SHARE, MAX_EDGE_SHARE))
+    inside = np.flatnonzero((share >= edge) & (share <= 1.0 - edge) & window.counted)
     if len(inside) < MAX_ONSETS // 10 or not faults:
         return None
     onsets = inside[:: max(1, len(inside) // MAX_ONSETS)]
