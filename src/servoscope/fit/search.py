@@ -49,7 +49,8 @@ class Experiment:
         e = np.zeros(0)
         if np.isfinite(x).all():  # LAPACK would say so on the terminal
             try:
-                e = self.residual(x)
+                with np.errstate(over="ignore", invalid="ignore"):  # a step too far gives numbers that cost too much
+                    e = self.residual(x)
             except CANNOT_RUN:
                 e = np.zeros(0)
         squares = float(e @ e) if len(e) else np.inf
