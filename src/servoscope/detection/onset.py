@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from servoscope.core.arrays import FloatArray
+from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.estimation.noise_model import long_run_inflation
 from servoscope.estimation.pipeline import Pipeline
 from servoscope.signals import Recording
 
 MEMORIES_BEFORE_ALARM = 40.0  # in which the onset is looked for first
 MIN_PROBABILITY = 1e-9  # of an onset before them, from which on the search goes further back
+MAX_LOG_RATIO = 1.92  # of two onsets that 95 % intervals both hold: half of what chi-square exceeds in 5 % of cases
 
 
 @dataclass(frozen=True)
@@ -43,10 +44,12 @@ def estimate_onset(
     while True:
         begin = max(until - reach, 0) // pipeline.stride * pipeline.stride
         near = recording.rows(slice(begin, min(last, until + reach) + 1))
-        likelihood = _log_likelihood(pipeline, near, healthy, faulty, until - begin)
+        likelihood, resting = _log_likelihood(pipeline, near, healthy, faulty, until - begin)
         weight = np.exp(likelihood - likelihood.max())
         share = np.cumsum(weight) / weight.sum()
-        likely = int(np.argmax(likelihood))
+        # a change while nothing is learned shows when the motion begins: what may have come at rest came at rest
+        at_rest = resting & (likelihood >= likelihood.max() - MAX_LOG_RATIO)
+        likely = int(np.argmax(at_rest if at_rest.any() else likelihood))
         if not begin or share[(until - begin) // 2] < MIN_PROBABILITY:
             break
         reach *= 2  # the change may have come earlier
@@ -61,8 +64,8 @@ def estimate_onset(
 
 def _log_likelihood(
     pipeline: Pipeline, recording: Recording, healthy: FloatArray, faulty: FloatArray, until: int
-) -> FloatArray:
-    """Return the logarithm of the likelihood of a change at each of the samples up to `until`, but for a constant."""
+) -> tuple[FloatArray, BoolArray]:
+    """Return the log likelihood of a change at each sample up to `until`, and which samples are left out."""
     # u itself changes at once, where u_a of stage 1 has to learn the change first
     single = replace(pipeline, stage_one=None)
     g = single.regression(recording.r, recording.u, recording.y, recording.restart)
@@ -79,7 +82,7 @@ def _log_likelihood(
     best = at_update[int(np.argmax(gained[at_update]))]
     e = v - size[best] * changed * np.concatenate([np.zeros(best), ramp, np.ones(len(v))])[: len(v)]
     variance = float(e @ e) / max(int(ok.sum()), 1) * long_run_inflation((e * changed)[ok], len(ramp))
-    return np.asarray(gained[at_update] / (2.0 * variance))
+    return np.asarray(gained[at_update] / (2.0 * variance)), ~ok[at_update]
 
 
 def _onset_of_filters(pipeline: Pipeline) -> FloatArray:
