@@ -15,8 +15,9 @@ from math import comb
 import numpy as np
 from tables import Table, parser, show
 
-from servoscope.baseline.feature_model import FeatureGroup, FeatureModel, GroupStatistic, score_limit
+from servoscope.baseline.feature_model import FeatureGroup, FeatureModel, GroupStatistic
 from servoscope.baseline.feature_spans import SpanFeatures
+from servoscope.baseline.threshold import score_limit
 from servoscope.core.arrays import FloatArray
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.models.loop import FEATURE_FALSE_ALARMS

@@ -91,9 +91,9 @@ else:  # hidden from type checkers, which would otherwise accept any name
 
         if name not in _HOMES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        found = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-        globals()[name] = found  # the next access does not come here
-        return found
+        public = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+        globals()[name] = public  # the next access does not come here
+        return public
 
     def __dir__() -> list[str]:
         return sorted({*__all__, "NoveltyDetector"})

@@ -193,11 +193,7 @@ def test_constants_that_bound_are_told_from_vague_ones() -> None:
     assert [name for name in names if is_vague(name)] == ["FEW", "MOST_ROWS", "SETTLED"]
 
 
-# Words that say nothing of a local, and the packages in which none is left.
-VAGUE_LOCALS = {"one", "found", "each", "rest", "more"}
-NAMED_PACKAGES = {
-    "assessment", "cli", "core", "design", "fleet", "prognosis", "report", "research", "scoring", "signals",
-}  # fmt: skip
+VAGUE_LOCALS = {"one", "found", "each", "rest", "more"}  # which say nothing of what they hold
 
 
 def locals_of(tree: ast.AST) -> Iterator[tuple[str, int]]:
@@ -216,7 +212,6 @@ def test_locals_say_what_they_are() -> None:
     vague = {
         f"{source.path.as_posix()}:{line}: {name}"
         for source in SOURCES
-        if source.path.parts[0] in NAMED_PACKAGES
         for name, line in locals_of(source.tree)
         if name in VAGUE_LOCALS
     }

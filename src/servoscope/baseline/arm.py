@@ -251,13 +251,13 @@ def complete_columns(model: ArmModel, signals: ArmSignals, theta: FloatArray, te
     motion = (signals.v, signals.a) if model.loop.curve_speed else (still, still)  # as in models that are published
     load = np.abs(model.inertial_torque(signals.q, *motion, theta[: len(model.base.names)]))
     own = [{what: signals.columns[:, at[f"{name}.{what}"]] for what in FRICTION[:2]} for name in model.arm.names]
-    more = [own[j]["coulomb_friction"] * load[j] for j in range(n)]
+    further = [own[j]["coulomb_friction"] * load[j] for j in range(n)]
     for j, joint in enumerate(model.loop.columns_of(model.arm)):
         if joint.temperature is not None:
-            more += [own[j][what] * (signals.temperature[:, j] - temperature[j]) for what in FRICTION[:2]]
+            further += [own[j][what] * (signals.temperature[:, j] - temperature[j]) for what in FRICTION[:2]]
     if model.loop.tool is not None:
-        more += [signals.mass[:, index] * signals.tool for index in range(len(PAYLOAD))]
-    columns = np.concatenate([signals.columns, np.stack(more, axis=1)], axis=1)
+        further += [signals.mass[:, index] * signals.tool for index in range(len(PAYLOAD))]
+    columns = np.concatenate([signals.columns, np.stack(further, axis=1)], axis=1)
     if not model.loop.curve_speed:
         return columns
     expected = np.einsum("jpm,p->jm", columns, theta[: columns.shape[1]])
@@ -303,12 +303,12 @@ def deviation_scales(model: ArmModel, theta: FloatArray, torque: FloatArray) -> 
 
 def arm_causes(model: ArmModel) -> tuple[ArmCause, ...]:
     """Return the changes that are told apart, as columns of `deviation_columns`; the last is any of them at once."""
-    found, coulombs = [], []
+    causes, coulombs = [], []
     first = len(PAYLOAD)
     for name, joint in zip(model.arm.names, model.loop.columns_of(model.arm), strict=True):
         viscous, coulomb, load, offset, sine, cosine, gain = range(first, first + 7)
         coulombs.append(coulomb)
-        found += [
+        causes += [
             ArmCause("friction", name, (coulomb,), "coulomb_friction"),
             ArmCause("friction", name, (viscous,), "viscous_friction"),
             ArmCause("friction", name, (coulomb, viscous, load), "coulomb_friction"),
@@ -318,10 +318,10 @@ def arm_causes(model: ArmModel) -> tuple[ArmCause, ...]:
         ]
         for index, period in enumerate(joint.ripple):
             sines = first + 7 + 2 * index, first + 8 + 2 * index
-            found.append(ArmCause("gear ripple", name, sines, f"ripple {period:g}"))
+            causes.append(ArmCause("gear ripple", name, sines, f"ripple {period:g}"))
         first += 8 + 2 * len(joint.ripple)
-        found.append(ArmCause("encoder offset", name, (first - 1,), "encoder"))
+        causes.append(ArmCause("encoder offset", name, (first - 1,), "encoder"))
     # a payload loads the gears, which rub more then
     payload = tuple(range(len(PAYLOAD)))
-    found += [ArmCause("payload", "", payload, "m"), ArmCause("payload", "", (*payload, *coulombs), "m")]
-    return (*found, ArmCause(UNKNOWN, "", tuple(range(first)), UNKNOWN))
+    causes += [ArmCause("payload", "", payload, "m"), ArmCause("payload", "", (*payload, *coulombs), "m")]
+    return (*causes, ArmCause(UNKNOWN, "", tuple(range(first)), UNKNOWN))

@@ -166,9 +166,9 @@ class Baseline(ShortRepr, LearnedEvidence):
         """
         if not isinstance(point, str):
             return self._at_covariates(point)
-        for one in self.per_point:
-            if point and one.point == point:
-                return one
+        for baseline in self.per_point:
+            if point and baseline.point == point:
+                return baseline
         known = f"choose from {', '.join(self.points)}" if self.points else "the baseline has none"
         raise BaselineError(f"there is no operating point {point!r}: {known}")
 
@@ -351,7 +351,7 @@ class Baseline(ShortRepr, LearnedEvidence):
         fields = group_flat_fields(fields) if version == FLAT_VERSION else fields
         try:
             baseline = cls.model_validate(fields)
-            _ = [one.loop for one in baseline.per_point]
+            _ = [point.loop for point in baseline.per_point]
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(str(part) for part in first["loc"])

@@ -118,8 +118,8 @@ class CovariateModel(BaseModel):
         """Return that covariates (N, k) leave the learned range; None where they do not."""
         lowest, highest = np.nanmin(c, axis=0), np.nanmax(c, axis=0)
         for j in range(len(self.names)):
-            one = np.where(np.arange(len(self.names)) == j, [lowest, highest], self.origin)
-            if self.is_inside(one).all():
+            ends = np.where(np.arange(len(self.names)) == j, [lowest, highest], self.origin)
+            if self.is_inside(ends).all():
                 continue
             seen, known = _span(lowest[j], highest[j]), _span(self.low[j], self.high[j])
             return message("covariate.outside", covariate=self.names[j], seen=seen, known=known)

@@ -203,15 +203,15 @@ def model_error_covariance(pipeline: Pipeline, tuning: Tuning, means: FloatArray
 def learn_motion(pipeline: Pipeline, recordings: Sequence[Recording]) -> MotionRange | None:
     """Return which motion healthy recordings hold; None where none is as long as the shortest window."""
     origin = float(np.average([rec.y.mean() for rec in recordings], weights=[rec.samples for rec in recordings]))
-    found: list[FloatArray] = []
+    stretches: list[FloatArray] = []
     for recording in recordings:
         motion = RecordedMotion.from_recording(pipeline, recording, origin)
         values, filled = motion.quantities(slice(None))
         full = filled[:, 0] >= min(1.0, filled[:, 0].max(initial=0.0))
         if full.any() and filled[:, 0].max() >= MIN_WINDOW_SHARE:
-            found.append(values[full])
-    if not found:
+            stretches.append(values[full])
+    if not stretches:
         return None
-    values = np.concatenate(found)
+    values = np.concatenate(stretches)
     least, most = (to_tuples(x) for x in (values.min(axis=0), values.max(axis=0)))
     return MotionRange(origin=origin, least=least, most=most)

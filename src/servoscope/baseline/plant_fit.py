@@ -77,17 +77,17 @@ def can_simulate(loop: Loop) -> bool:
     return loop.controller is not None and loop.plant.has_physics and not loop.plant.extras
 
 
-def split_residual_noise(pipeline: Pipeline, found: TuningFit, regressions: Sequence[Regression]) -> WhiteNoise:
+def split_residual_noise(pipeline: Pipeline, tuning: TuningFit, regressions: Sequence[Regression]) -> WhiteNoise:
     """Split the residual into n_u and n_y; with two stages its autocovariance is a non-negative mixture of theirs."""
     from scipy.optimize import nnls
 
-    if found.noises is not None:
-        return found.noises.noise
+    if tuning.noises is not None:
+        return tuning.noises.noise
 
     lags = 20
     system = residual_system(pipeline, pipeline.loop.plant)
-    columns = [autocovariances(system.input(one[:, None]), lags, pipeline.stride)[:, 0, 0] for one in np.eye(2)]
-    measured = sample_autocovariance([(g.eta - g.phi @ found.tuning.theta)[g.ok] for g in regressions], lags)
+    columns = [autocovariances(system.input(unit[:, None]), lags, pipeline.stride)[:, 0, 0] for unit in np.eye(2)]
+    measured = sample_autocovariance([(g.eta - g.phi @ tuning.tuning.theta)[g.ok] for g in regressions], lags)
     size = np.array([column[0] for column in columns])
     shares, _ = nnls(np.column_stack(columns) / size, measured)
     u_std, y_std = np.sqrt(shares / size).tolist()
@@ -97,7 +97,7 @@ def split_residual_noise(pipeline: Pipeline, found: TuningFit, regressions: Sequ
 def fit_healthy_plant(
     expectations: Sequence[Expectation],
     regressions: Sequence[Regression],
-    found: TuningFit,
+    tuning: TuningFit,
     theta: FloatArray,
     noise: ArmaNoise,
 ) -> HealthyPlant:
@@ -121,13 +121,13 @@ def fit_healthy_plant(
     start = np.zeros(len(plant.parameters))
     experiment = Experiment(misfit, start + PRIOR_STD, low=-MAX_LOGARITHM, high=MAX_LOGARITHM, difference=DIFFERENCE)
     fitted = search.fit(experiment, start, steps=MAX_STEPS)
-    return describe_healthy_plant(expectations, regressions, found, plant.parameters, fitted.x, fitted.covariance)
+    return describe_healthy_plant(expectations, regressions, tuning, plant.parameters, fitted.x, fitted.covariance)
 
 
 def describe_healthy_plant(
     expectations: Sequence[Expectation],
     regressions: Sequence[Regression],
-    found: TuningFit,
+    tuning: TuningFit,
     names: Sequence[str],
     x: FloatArray,
     C: FloatArray,
@@ -147,9 +147,9 @@ def describe_healthy_plant(
     J = np.array([expected(x + step * e) - expected(x - step * e) for e in np.eye(len(x))]).T
     J /= 2.0 * step
     limit = expected(x)
-    size = np.sqrt(np.diag(found.covariance))
-    off = (found.tuning.theta - limit) / size
-    covariance = found.covariance / np.outer(size, size) + 1e-9 * np.eye(len(size))
+    size = np.sqrt(np.diag(tuning.covariance))
+    off = (tuning.tuning.theta - limit) / size
+    covariance = tuning.covariance / np.outer(size, size) + 1e-9 * np.eye(len(size))
     final = plant.scaled(ratios(x))
     true = nominal_theta(expectations[0].pipeline.loop, final)
     return HealthyPlant(

@@ -65,13 +65,13 @@ class PressureLayout(BaselineModel):
 
     def sums(self, recording: Recording) -> Sums:
         """Return the sums of a recording, piece by piece of `PIECE_S`: (pieces, k + 1, k + 1) by equation."""
-        length, found = max(round(PIECE_S * recording.sample_rate), 1), list[list[FloatArray]]()
+        length, sums = max(round(PIECE_S * recording.sample_rate), 1), list[list[FloatArray]]()
         for rows in outofcore.iter_chunks(0, recording.samples):
             tables = list(self._tables(recording.rows(rows)))
             cuts = range(0, rows.stop - rows.start, length)
-            found.append([np.array([x[k : k + length].T @ x[k : k + length] for k in cuts]) for x in tables])
+            sums.append([np.array([x[k : k + length].T @ x[k : k + length] for k in cuts]) for x in tables])
             outofcore.release(*recording.columns)
-        flow, force, supply = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        flow, force, supply = (np.concatenate(parts) for parts in zip(*sums, strict=True))
         return flow, self._without_area(force), supply
 
     def _without_area(self, sums: FloatArray) -> FloatArray:
@@ -112,7 +112,7 @@ class PressureLayout(BaselineModel):
 
     def coefficients(self, sums: Sums) -> FloatArray:
         """Return least squares on sums of a stretch, (k + 1, k + 1) each; NaN where a column is hardly there."""
-        found, at = [], 0
+        blocks, at = [], 0
         for S in sums:
             size, k = np.sqrt(np.diag(S)), len(S) - 1
             rms = np.array(self.rms[at : at + k]) if self.rms else np.zeros(k)
@@ -122,9 +122,9 @@ class PressureLayout(BaselineModel):
                 scaled = S / np.outer(size, size).clip(np.finfo(np.float64).tiny)
                 solved = np.linalg.lstsq(scaled[np.ix_(known, known)], scaled[known, k], rcond=1e-12)[0]
                 values[known] = solved * size[k] / size[known]
-            found.append(values)
+            blocks.append(values)
             at += k
-        return np.concatenate(found)
+        return np.concatenate(blocks)
 
     def _rows(self, sums: Sums) -> float:
         """Return the number of samples behind sums: the supply has a column of ones."""

@@ -133,9 +133,9 @@ def residual_samples(pipeline: Pipeline, layout: ResidualLayout, recording: Reco
 
 def _features(sums: FloatArray, fade: float) -> FloatArray:
     """Return the features (SIZE,) of sums, in units of u; a mean of few samples fades to 0, which is expected of it."""
-    counts, means, products, squares, rest = np.split(sums, np.cumsum([CLASSES, CLASSES, CORRELATIONS, CORRELATIONS]))
-    correlations = products / np.sqrt(np.maximum(squares, np.finfo(np.float64).tiny) * rest[2])
-    return np.concatenate([means / (counts + fade), correlations, np.sqrt(rest[:1] / rest[2])])
+    counts, means, products, squares, last = np.split(sums, np.cumsum([CLASSES, CLASSES, CORRELATIONS, CORRELATIONS]))
+    correlations = products / np.sqrt(np.maximum(squares, np.finfo(np.float64).tiny) * last[2])
+    return np.concatenate([means / (counts + fade), correlations, np.sqrt(last[:1] / last[2])])
 
 
 class ResidualModel(BaselineModel):

@@ -110,14 +110,14 @@ class FeatureEvidence:
         first, *others = sorted(self._compare(statistic, span), key=lambda row: -abs(row[3]))[:MAX_FEATURES_NAMED]
         return tuple(_describe(*row[:3]) for row in (first, *(row for row in others if abs(row[3]) >= MIN_STD)))
 
-    def _compare(self, one: GroupStatistic, span: SpanScore) -> list[tuple[FeatureName, float, float, float]]:
+    def _compare(self, statistic: GroupStatistic, span: SpanScore) -> list[tuple[FeatureName, float, float, float]]:
         """Return the features of a group: name, value, what is healthy, by how many standard deviations they differ."""
-        (values, _), covariates = one.group.pick(span.features), span.features.covariates
-        off, healthy = np.nan_to_num(one.deviations(values, covariates)), one.expected(covariates)
-        if one.group.past:  # described by the later windows against the earlier ones
-            later = span.features.values[one.group.level, list(one.group.kept)]
+        (values, _), covariates = statistic.group.pick(span.features), span.features.covariates
+        off, healthy = np.nan_to_num(statistic.deviations(values, covariates)), statistic.expected(covariates)
+        if statistic.group.past:  # described by the later windows against the earlier ones
+            later = span.features.values[statistic.group.level, list(statistic.group.kept)]
             values, healthy = later, later - values + healthy
-        names = [FeatureName.of(self.model.layout, feature) for feature in one.group.kept]
+        names = [FeatureName.of(self.model.layout, feature) for feature in statistic.group.kept]
         return list(zip(names, values.tolist(), healthy.tolist(), off.tolist(), strict=True))
 
 
@@ -135,8 +135,8 @@ def mean_of(spans: Sequence[SpanFeatures]) -> SpanFeatures:
     )
 
 
-def _weighted_mean(each: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
-    values = np.array(each)
+def _weighted_mean(arrays: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
+    values = np.array(arrays)
     seen = np.isfinite(values)
     weight = np.where(seen, weights[:, :, None], 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):

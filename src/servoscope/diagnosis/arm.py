@@ -190,7 +190,7 @@ def _event_warnings(events: Sequence[ArmEvent], recording: ArmRecording) -> Iter
 
 
 def _still_warnings(names: Sequence[str], moved: BoolArray, recording: ArmRecording) -> Iterator[DiagnosisWarning]:
-    still = [name for name, each in zip(names, moved, strict=True) if not each]
+    still = [name for name, has_moved in zip(names, moved, strict=True) if not has_moved]
     if still:
         yield _warning("rest", recording.t[0], recording.t[-1], message("arm.still", joints=still))
 
@@ -199,15 +199,15 @@ def _coefficients(baseline: ArmBaseline, information: Information) -> dict[str, 
     """Return friction and offset of each joint as the whole recording shows them."""
     covariance = np.linalg.inv(information.A.sum(0) + baseline.random_effect)
     shift, first = covariance @ information.g.sum(0), len(baseline.theta)
-    found = {}
+    values = {}
     for cause in baseline.causes:
         name = f"{cause.joint}.{cause.parameter}"
         if name in baseline.names and len(cause.columns) == 1:
             pair = [baseline.names.index(name), first + cause.columns[0]]
             value = baseline.theta[pair[0]]
             std = float(np.sqrt(covariance[np.ix_(pair, pair)].sum()))
-            found[name] = FinalCoefficient(value=value + float(shift[pair].sum()), std=std, nominal=value)
-    return found
+            values[name] = FinalCoefficient(value=value + float(shift[pair].sum()), std=std, nominal=value)
+    return values
 
 
 def _smallest_changes(baseline: ArmBaseline, information: Information, moved: BoolArray) -> list[Message]:
@@ -333,19 +333,19 @@ def _onset_interval(t: FloatArray, onset: FloatArray) -> tuple[tuple[float, floa
     return (float(first), float(t[int(onset.argmax())]), float(last)), low == 0
 
 
-def _fault(baseline: ArmBaseline, found: CauseEvidence) -> FaultEstimate | None:
+def _fault(baseline: ArmBaseline, evidence: CauseEvidence) -> FaultEstimate | None:
     """Return a cause with its size; None of a change that is not known."""
-    kind, joint, name = found.cause.kind, found.cause.joint, found.cause.name
+    kind, joint, name = evidence.cause.kind, evidence.cause.joint, evidence.cause.name
     if kind == UNKNOWN:
         return None
-    value, low, high = _interval(baseline, found)
+    value, low, high = _interval(baseline, evidence)
     if kind == "payload":
         link = float(baseline.model.arm.inertial[-1, 0])
         ratios = 1.0 + np.array([value, low, high]) / link
         return FaultEstimate(
             name=name, parameter="payload", ratio=ratios[0], interval=tuple(ratios[1:]), mass_kg=(value, low, high)
         )
-    own = f"{joint}.{found.cause.parameter}"
+    own = f"{joint}.{evidence.cause.parameter}"
     if kind == "friction":
         unit = baseline.coefficient(own)[0]
     elif kind == "drive gain":  # torque per current that is logged: the residual grows as the gain falls
@@ -359,32 +359,32 @@ def _fault(baseline: ArmBaseline, found: CauseEvidence) -> FaultEstimate | None:
     )
 
 
-def _interval(baseline: ArmBaseline, found: CauseEvidence) -> tuple[float, float, float]:
+def _interval(baseline: ArmBaseline, evidence: CauseEvidence) -> tuple[float, float, float]:
     """Return the size of a cause with its 95 % interval: of its first column, or the amplitude of several."""
-    size = found.size
-    if found.cause.kind in ("counterbalance", "gear ripple"):  # sine and cosine
+    size = evidence.size
+    if evidence.cause.kind in ("counterbalance", "gear ripple"):  # sine and cosine
         value = float(np.hypot(size[0], size[1]))
         gradient = np.zeros(size.size)
         gradient[:2] = size[:2] / max(value, 1e-300)
-        half = INTERVAL * float(np.sqrt(gradient @ found.covariance @ gradient))
+        half = INTERVAL * float(np.sqrt(gradient @ evidence.covariance @ gradient))
     else:
-        value, std = float(size[0]), float(np.sqrt(found.covariance[0, 0]))
-        if found.cause.kind == "friction":  # it is a ratio to a healthy value, which differs between recordings
-            healthy = baseline.coefficient(f"{found.cause.joint}.{found.cause.parameter}")[0]
-            std = float(np.hypot(std, value * baseline.between[found.cause.columns[0]] / healthy))
+        value, std = float(size[0]), float(np.sqrt(evidence.covariance[0, 0]))
+        if evidence.cause.kind == "friction":  # it is a ratio to a healthy value, which differs between recordings
+            healthy = baseline.coefficient(f"{evidence.cause.joint}.{evidence.cause.parameter}")[0]
+            std = float(np.hypot(std, value * baseline.between[evidence.cause.columns[0]] / healthy))
         half = INTERVAL * std
     return value, value - half, value + half
 
 
-def _size(baseline: ArmBaseline, found: CauseEvidence) -> Message:
+def _size(baseline: ArmBaseline, evidence: CauseEvidence) -> Message:
     """Return the size of a cause as a sentence."""
-    kind = found.cause.kind
-    value, low, high = _interval(baseline, found)
+    kind = evidence.cause.kind
+    value, low, high = _interval(baseline, evidence)
     if kind == "payload":
         return message("arm.size_mass", value=value, low=low, high=high)
-    fault = _fault(baseline, found)
+    fault = _fault(baseline, evidence)
     if kind in ("friction", "drive gain") and fault is not None:
         least, most = fault.interval
-        parameter = found.cause.parameter.replace("_", " ")
+        parameter = evidence.cause.parameter.replace("_", " ")
         return message("arm.size_ratio", parameter=parameter, ratio=fault.ratio, low=least, high=most)
     return message("arm.size", value=value, low=low, high=high, unit=UNITS[kind])

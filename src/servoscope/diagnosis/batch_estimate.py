@@ -72,14 +72,14 @@ def _fit_stretch(exam: Examination, from_s: float, to_s: float) -> InstrumentalF
     assert baseline.recursion.instrument is not None
     try:
         rec = exam.recording.part(from_s, to_s)
-        found = fit_with_instrument(
+        estimate = fit_with_instrument(
             exam.pipeline, [rec], baseline.recursion.instrument.source, np.array(baseline.theta)
         )
     except (RecordingError, np.linalg.LinAlgError) as error:
         raise NotEnoughError(f"{name}, from {from_s:.4g} s on: {error}") from None
-    if found is None or not found.trusted:
+    if estimate is None or not estimate.trusted:
         raise NotEnoughError(f"{name}, from {from_s:.4g} s on: noise in y hides the coefficients, record longer")
-    return found
+    return estimate
 
 
 def isolation_inputs(exam: Examination, onset: Onset, at: int) -> tuple[list[Signature], FloatArray, FloatArray]:

@@ -74,7 +74,9 @@ def corrected_trace(exam: Examination, correction: BiasCorrection | None, at: sl
     faulty = _faulty_path(exam, correction, at)
     for rows in outofcore.iter_chunks(0, K, e.S, e.Psi, e.theta, exam.expected, at_once=AT_ONCE):
         part = slice(at.start + rows.start, at.start + rows.stop)
-        th, S, th0 = _correct_bias(exam, correction, part, *(None if each is None else each[rows] for each in faulty))
+        th, S, th0 = _correct_bias(
+            exam, correction, part, *(None if array is None else array[rows] for array in faulty)
+        )
         theta[rows], covariance[rows], expected[rows] = th, S, th0
         for whole, estimate, spread in (
             (response, th, S),
@@ -146,8 +148,8 @@ def _corrected_covariance(
     lag = np.abs(updates - exam.estimates.updates[correction.evaluation])
     shared = np.exp(-lag / exam.pipeline.memory)[:, None, None]
     G, M = correction.gain, correction.gain - np.eye(len(correction.gain))
-    found: FloatArray = shared * (G @ covariance @ G.T) + (1.0 - shared) * (covariance + M @ covariance @ M.T)
-    return found
+    corrected: FloatArray = shared * (G @ covariance @ G.T) + (1.0 - shared) * (covariance + M @ covariance @ M.T)
+    return corrected
 
 
 def fit_actuator(

@@ -161,7 +161,7 @@ def _judge_signals(
     model = points[0].covariates
     if model is not None and (missing := model.describe_missing(recording.channels)) is not None:
         raise RecordingError(f"{recording.name}: {missing}")
-    exams = [Examination.from_recording(one, recording) for one in points]
+    exams = [Examination.from_recording(at_point, recording) for at_point in points]
     if (unusable := next(findings(exams[0], "undetermined"), None)) is not None:
         change = _feature_change(exams[0]) if unusable.kind == "outside" else {}
         return leave_undetermined(exams[0], unusable.text).model_copy(update=change), exams[0], None
@@ -180,18 +180,18 @@ def _judge_signals(
     noise = find_louder_noise(recording, baseline.loop.monitor.memory) if baseline.axis is None else None
     if noise is not None:
         return judge_both_sides(recording, noise, lambda side: _judge_signals(baseline, side, progress, point))
-    found = sorted(
+    diagnoses = sorted(
         ((*diagnose_examination(exam, progress), exam) for exam in rivals),
-        key=lambda one: (one[0].verdict != "fault", _change_size(one[0])),
+        key=lambda judged: (judged[0].verdict != "fault", _change_size(judged[0])),
     )
-    diagnosis, correction, exam = found[0]
-    others = [message("warning.point", other=other.headline) for other, *_ in found[1:] if _is_explained(other)]
+    diagnosis, correction, exam = diagnoses[0]
+    others = [message("warning.point", other=other.headline) for other, *_ in diagnoses[1:] if _is_explained(other)]
     doubts = [warning_throughout(exam, "point", other) for other in others]
     return _with_warnings(diagnosis, [*sensors, *doubts]), exam, correction
 
 
-def _with_warnings(diagnosis: Diagnosis, more: Sequence[DiagnosisWarning]) -> Diagnosis:
-    return diagnosis.model_copy(update={"warnings": (*diagnosis.warnings, *more)}) if more else diagnosis
+def _with_warnings(diagnosis: Diagnosis, warnings: Sequence[DiagnosisWarning]) -> Diagnosis:
+    return diagnosis.model_copy(update={"warnings": (*diagnosis.warnings, *warnings)}) if warnings else diagnosis
 
 
 def _first_alarm_time(exam: Examination) -> float:
@@ -236,7 +236,9 @@ def diagnose_examination(
         headline, intervals, warnings = change["headline"], change["intervals"], _all_warnings(exam, [])
     else:
         verdict, headline, warnings = judge_without_alarm(exam)
-    interval = next((one for one in intervals if _covers(one, float(exam.t(at)))), intervals[-1] if intervals else None)
+    interval = next(
+        (known for known in intervals if _covers(known, float(exam.t(at)))), intervals[-1] if intervals else None
+    )
     correction = estimate_bias_correction(exam, interval.candidates if interval else (), onset, at)
     end = corrected_trace(exam, correction, slice(max(last, 0), last + 1))
     explained = end if at == last else corrected_trace(exam, correction, slice(at, at + 1))
@@ -346,9 +348,9 @@ def _covers(interval: FaultInterval, t: float) -> bool:
 def _onset_of(intervals: Sequence[FaultInterval], exam: Examination, alarm: RecordingAlarm) -> Onset:
     """Return the onset of the interval in which the explained evaluation lies, the last one where none does."""
     at = float(exam.t(alarm.evaluation))
-    one = next((each for each in intervals if _covers(each, at)), intervals[-1])
-    assert one.onset_s is not None
-    return Onset(*one.onset_s, int(np.searchsorted(exam.recording.t, one.onset_s[1])))
+    interval = next((known for known in intervals if _covers(known, at)), intervals[-1])
+    assert interval.onset_s is not None
+    return Onset(*interval.onset_s, int(np.searchsorted(exam.recording.t, interval.onset_s[1])))
 
 
 def _prefers_learned_fault(refined: RefitResult, recursive: Candidate) -> bool:

@@ -130,16 +130,16 @@ def _onset_message(interval: FaultInterval) -> Message | None:
 def _ambiguous_headline(likely: Sequence[Candidate], at: Message | None, since: Message | None) -> Message:
     """Say which explanations remain, and which parameters they confuse."""
     known = [c for c in likely if c.name != UNKNOWN]
-    rest = [message("diagnosis.candidate_unknown", probability=c.probability) for c in likely if c.name == UNKNOWN]
+    unknown = [message("diagnosis.candidate_unknown", probability=c.probability) for c in likely if c.name == UNKNOWN]
     listed = [message("diagnosis.candidate", names=_labels(c.names), probability=c.probability) for c in known]
-    if len(known) == 1 and rest:
-        return message("diagnosis.fault_or_unknown", point=at, since=since, candidate=listed[0], unknown=rest[0])
+    if len(known) == 1 and unknown:
+        return message("diagnosis.fault_or_unknown", point=at, since=since, candidate=listed[0], unknown=unknown[0])
     if len(known) == 1:
         return message("diagnosis.fault_uncertain", point=at, since=since, candidate=listed[0])
     pairs = [{fault.parameter for fault in c.faults} for c in known if len(c.faults) > 1]
     every = [parameter for pair in pairs for parameter in pair]
     confused = sorted(parameter for parameter in set(every) if every.count(parameter) < len(pairs))
-    values = {"point": at, "since": since, "candidates": (*listed, *rest)}
+    values = {"point": at, "since": since, "candidates": (*listed, *unknown)}
     if len(pairs) == len(known):
         return message("diagnosis.fault_ambiguous_pairs", parameters=tuple(confused), **values)
     return message("diagnosis.fault_ambiguous", **values)

@@ -59,10 +59,10 @@ def add_learned_faults(
             for array in (rec.t, rec.r, rec.u, rec.y):
                 digest.update(np.ascontiguousarray(array).tobytes())
         digest.update(name.encode())
-    found = baseline.model_copy(update={"learned": tuple(learned), "hash": digest.hexdigest()[:16]})
+    result = baseline.model_copy(update={"learned": tuple(learned), "hash": digest.hexdigest()[:16]})
     progress("faults compared")
-    notes += [note for name, faulty in examined.items() if (note := _confusion_note(found, name, faulty)) is not None]
-    return found.model_copy(update={"notes": tuple(notes)})
+    notes += [note for name, faulty in examined.items() if (note := _confusion_note(result, name, faulty)) is not None]
+    return result.model_copy(update={"notes": tuple(notes)})
 
 
 def _fault_deviation(exam: Examination) -> tuple[FloatArray, FloatArray]:
@@ -122,8 +122,10 @@ def _undetected_message(name: str, exams: Sequence[Examination]) -> str:
     if not exams:
         return f"{name}: no recording to learn from, give at least one"
     share = max(float(exam.statistic.max(initial=0.0)) / exam.baseline.thresholds.statistic for exam in exams)
-    one = len(exams) == 1
-    subject = f"{exams[0].recording.name} does not differ" if one else f"none of {len(exams)} recordings of it differs"
+    is_single = len(exams) == 1
+    subject = (
+        f"{exams[0].recording.name} does not differ" if is_single else f"none of {len(exams)} recordings of it differs"
+    )
     return (
         f"{name}: {subject} from healthy (T² reaches {share:.0%} of its limit), and a fault that does not show cannot "
         "be learned: record it more severe, under motion with more excitation or at another load"

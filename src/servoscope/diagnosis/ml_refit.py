@@ -42,13 +42,13 @@ def refit_recording(
     return replace(hypotheses, window=replace(hypotheses.window, first_sample=hypotheses.window.first_sample + begin))
 
 
-def vibration_interval(exam: Examination, found: AxisVibration) -> FaultInterval:
+def vibration_interval(exam: Examination, vibration: AxisVibration) -> FaultInterval:
     """Return the interval of an axis that swings or rattles: no coefficient changed, so nothing is refitted."""
     from servoscope.isolation.ml.search import OUTSIDE_PRIOR
 
     t = exam.recording.t
-    low, likely, high = (float(t[k]) for k in found.onset)
-    fault = FaultEstimate(name=VIBRATION, parameter=VIBRATION, ratio=found.ratio, interval=found.interval)
+    low, likely, high = (float(t[k]) for k in vibration.onset)
+    fault = FaultEstimate(name=VIBRATION, parameter=VIBRATION, ratio=vibration.ratio, interval=vibration.interval)
     named = Candidate(name=VIBRATION, probability=1.0 - OUTSIDE_PRIOR, faults=(fault,))
     assert exam.change is not None
     return FaultInterval(
@@ -156,7 +156,7 @@ def disagreement_warnings(
             for a, b in zip(candidate.faults, other.faults, strict=True)
             if size_distance_std(a, b) > MAX_SIZE_DISTANCE
         ]
-    return [warning_throughout(exam, "disagreement", each) for each in messages[-1:]]
+    return [warning_throughout(exam, "disagreement", text) for text in messages[-1:]]
 
 
 def size_distance_std(a: FaultEstimate, b: FaultEstimate) -> float:
@@ -165,17 +165,17 @@ def size_distance_std(a: FaultEstimate, b: FaultEstimate) -> float:
     return abs(float(np.log(a.ratio / b.ratio))) / max(spread, 1e-12)
 
 
-def _candidate(each: Hypothesis, plant: Plant, least: float, noise_variance: float) -> Candidate:
-    fitted = each.fitted
-    ratios, intervals = np.exp(fitted.x), np.exp(np.array(each.evidence.intervals))
+def _candidate(hypothesis: Hypothesis, plant: Plant, least: float, noise_variance: float) -> Candidate:
+    fitted = hypothesis.fitted
+    ratios, intervals = np.exp(fitted.x), np.exp(np.array(hypothesis.evidence.intervals))
     faults = tuple(
         _fault_estimate(fault, plant, float(ratio), float(low), float(high))
         for fault, ratio, (low, high) in zip(fitted.faults, ratios, intervals, strict=True)
     )
     covariance = tuple(tuple(row) for row in (noise_variance * fitted.covariance).tolist()) if len(faults) > 1 else None
     return Candidate(
-        name=each.name,
-        probability=each.probability,
+        name=hypothesis.name,
+        probability=hypothesis.probability,
         faults=faults,
         misfit=max(fitted.cost - least, 0.0) / noise_variance,
         covariance=covariance,

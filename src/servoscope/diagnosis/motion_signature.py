@@ -103,7 +103,7 @@ def signature_columns(recording: Recording, loop: Loop, onset_s: float | None) -
     deviations.
     """
     before, after = compare_signatures(recording, loop, onset_s)
-    found = []
+    stretches = []
     for words, signature in (("before", before), ("after" if before else "measured", after)):
         if signature is not None:
             widths = {"friction_band": signature.friction_band, "lost_motion": signature.lost_motion}
@@ -113,8 +113,10 @@ def signature_columns(recording: Recording, loop: Loop, onset_s: float | None) -
             plain = {
                 name: [None if math.isnan(x) else float(f"{x:.6g}") for x in curve] for name, curve in curves.items()
             }
-            found.append({"words": words, **plain, **{name: list(width) for name, width in widths.items() if width}})
-    return found
+            stretches.append(
+                {"words": words, **plain, **{name: list(width) for name, width in widths.items() if width}}
+            )
+    return stretches
 
 
 def _smoothed(x: FloatArray, restart: BoolArray, window: int, rate: float) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -124,15 +126,15 @@ def _smoothed(x: FloatArray, restart: BoolArray, window: int, rate: float) -> tu
     """
     from scipy.signal import savgol_coeffs
 
-    found = np.full((3, x.size), np.nan)
+    derivatives = np.full((3, x.size), np.nan)
     half = window // 2
     starts = np.flatnonzero(np.append(restart, True))
     weights = [savgol_coeffs(window, 2, deriv=k, delta=1.0 / rate, use="dot") for k in range(3)]
     for start, stop in zip(np.append(0, starts[starts > 0])[:-1], starts[starts > 0], strict=True):
         if stop - start >= window:
-            for row, weight in zip(found, weights, strict=True):
+            for row, weight in zip(derivatives, weights, strict=True):
                 row[start + half : stop - half] = np.correlate(x[start:stop], weight, mode="valid")
-    return found[0], found[1], found[2]
+    return derivatives[0], derivatives[1], derivatives[2]
 
 
 def _width_at_rest(

@@ -59,14 +59,14 @@ class NoveltyDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
     def fit(self, X: Recordings, y: npt.ArrayLike | None = None) -> Self:
         """Learn a baseline from recordings, or what `read` reads; with labels `y` only from those that are 1."""
         healthy = np.ones(len(X), bool) if y is None else np.asarray(y) == INLIER
-        self.baseline_ = learn(self.loop, [each for each, chosen in zip(X, healthy, strict=True) if chosen])
+        self.baseline_ = learn(self.loop, [recording for recording, chosen in zip(X, healthy, strict=True) if chosen])
         self.offset_ = -1.0
         return self
 
     @with_one_blas_thread
     def score_samples(self, X: Recordings) -> FloatArray:
         """Return minus the largest statistic of each recording over its limit, shape (len(X),)."""
-        return np.array([-self._excess(as_recording(each, self.baseline_.loop)) for each in X])
+        return np.array([-self._excess(as_recording(recording, self.baseline_.loop)) for recording in X])
 
     def decision_function(self, X: Recordings) -> FloatArray:
         """Return the scores over `offset_`, shape (len(X),): negative where a recording is unlike the healthy ones."""

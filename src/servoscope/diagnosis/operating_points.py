@@ -109,7 +109,7 @@ def learn(
     if isinstance(recordings, str | Path | Recording):
         recordings = [recordings]
     given = recordings if isinstance(recordings, Mapping) else {"": recordings}
-    named = {name: [as_recording(one, loop) for one in some] for name, some in given.items()}
+    named = {name: [as_recording(source, loop) for source in some] for name, some in given.items()}
     for name, some in named.items():
         if not name and isinstance(recordings, Mapping):
             raise BaselineError("an operating point needs a name, as in {'cold': [...], 'warm': [...]}")
@@ -122,21 +122,25 @@ def learn(
     learned: list[Baseline] = []
     alikes = _named_machines(population)
     if len(alikes) < MIN_MACHINES:
-        earlier = max([*alikes.values(), *filter(None, [earlier])], key=lambda each: each.scatter_from, default=None)
+        earlier = max([*alikes.values(), *filter(None, [earlier])], key=lambda prior: prior.scatter_from, default=None)
         alikes = {}
     for name, whole in named.items():
         some = _thin_out(loop, whole)
         check_wraps(some)
         like = Population.from_baselines(_machines_at(alikes, name)) if alikes else None
         before = earlier.at(name) if earlier is not None and name in earlier.points else earlier
-        one = learning.learn_baseline(loop, some, progress, accept_delay, like, before)
-        odd = check_plausibility(one, force or loop.implausible == "note")
+        baseline = learning.learn_baseline(loop, some, progress, accept_delay, like, before)
+        odd = check_plausibility(baseline, force or loop.implausible == "note")
         longest = max(some, key=lambda rec: rec.samples)
         progress("operating points")
-        rest = _judge_whole(one, whole, some)
+        whole_notes = _judge_whole(baseline, whole, some)
         alike = [note for other in learned if (note := _resemblance_note(other, name, longest)) is not None]
-        one = one.model_copy(update={"point": name, "notes": (*odd, *one.notes, *notes[name], *rest, *alike)})
-        learned.append(learn_faults.add_learned_faults(one, labels[name], progress) if name in labels else one)
+        baseline = baseline.model_copy(
+            update={"point": name, "notes": (*odd, *baseline.notes, *notes[name], *whole_notes, *alike)}
+        )
+        learned.append(
+            learn_faults.add_learned_faults(baseline, labels[name], progress) if name in labels else baseline
+        )
     return learned[0].model_copy(update={"others": tuple(learned[1:])})
 
 
@@ -176,8 +180,8 @@ def _named_machines(population: Mapping[str, Baseline] | Sequence[Baseline | str
     if isinstance(population, Mapping):
         return dict(population)
     return {
-        f"machine {i}" if isinstance(one, Baseline) else str(one): Baseline.of(one)
-        for i, one in enumerate(population, 1)
+        f"machine {i}" if isinstance(member, Baseline) else str(member): Baseline.of(member)
+        for i, member in enumerate(population, 1)
     }
 
 
@@ -191,19 +195,19 @@ def _group_by_point(
     recordings: Sequence[object] | Mapping[str, Sequence[object]],
 ) -> dict[str, LabelledRecordings]:
     """Return the labelled recordings of each operating point; the point of a baseline without points is ""."""
-    found: dict[str, dict[str, Sequence[Recording]]] = {}
+    groups: dict[str, dict[str, Sequence[Recording]]] = {}
     for key, value in faults.items():
         if isinstance(recordings, Mapping) != isinstance(value, Mapping):
             form = "{'cold': {'backlash': [...]}}" if isinstance(recordings, Mapping) else "{'backlash': [...]}"
             raise BaselineError(f"faults, {key}: give them by operating point where healthy ones are, as in {form}")
         if isinstance(value, Mapping):
-            found[key] = dict(value)
+            groups[key] = dict(value)
         else:
-            found.setdefault("", {})[key] = value
-    for point in found:
+            groups.setdefault("", {})[key] = value
+    for point in groups:
         if point and point not in recordings:
             raise BaselineError(f"faults at {point}: there are no healthy recordings at that operating point")
-    return {point: labels for point, labels in found.items() if labels}
+    return {point: labels for point, labels in groups.items() if labels}
 
 
 def compare_with_earlier(

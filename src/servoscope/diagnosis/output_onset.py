@@ -61,7 +61,7 @@ def _onset_by_output(
     u, y = near.u[:end], near.y[:end]
     x = [_states(model, u) for model in (healthy, changed)]
     models = zip((healthy, changed), x, strict=True)
-    before, after = (y - each @ model.C[0] - model.D[0, 0] * u for model, each in models)
+    before, after = (y - state @ model.C[0] - model.D[0, 0] * u for model, state in models)
     cost = _switch_costs(before, after, x[0] - x[1], changed)[: sample - begin + 1]
     settling = min(_transient(healthy), len(cost) - 1)
     variance = float(np.mean(before[settling : max(len(cost) // 2, settling + LAGS)] ** 2))
@@ -78,11 +78,11 @@ def _onset_by_output(
 
 def _states(model: LinearSystem, u: FloatArray) -> FloatArray:
     """Return the states of a model before each sample, shape (N, n), from the steady state at the first."""
-    x, driven, found = model.steady[:, 0] * u[0], u[:, None] * model.B[:, 0], np.empty((len(u), len(model.A)))
+    x, driven, states = model.steady[:, 0] * u[0], u[:, None] * model.B[:, 0], np.empty((len(u), len(model.A)))
     for k, entering in enumerate(driven):
-        found[k] = x
+        states[k] = x
         x = model.A @ x + entering
-    return found
+    return states
 
 
 def _transient(model: LinearSystem) -> int:
@@ -103,7 +103,7 @@ def _switch_costs(before: FloatArray, after: FloatArray, apart: FloatArray, chan
     decay, row = np.empty((W, len(changed.A))), changed.C[0]
     for j in range(W):
         decay[j], row = row, row @ changed.A
-    sums = [np.concatenate([[0.0], np.cumsum(each**2)]) for each in (before, after)]
+    sums = [np.concatenate([[0.0], np.cumsum(residual**2)]) for residual in (before, after)]
     padded, cost = np.concatenate([after, np.zeros(W)]), np.empty(N)
     windows = np.lib.stride_tricks.sliding_window_view(padded, W)
     for first in range(0, N, AT_ONCE):

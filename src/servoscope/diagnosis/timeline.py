@@ -56,14 +56,14 @@ def trace_timeline(
 
 def _fault_intervals(
     exam: Examination,
-    found: Sequence[TimelineStretch],
+    stretches: Sequence[TimelineStretch],
     first: int,
     recursive: tuple[Candidate, ...],
     sure: float,
     early_s: float,
 ) -> tuple[FaultInterval, ...]:
     intervals = []
-    for stretch, following in pairwise([*found, None]):
+    for stretch, following in pairwise([*stretches, None]):
         if stretch is None or stretch.refit is None:
             continue
         candidates = refit_candidates(stretch.refit)

@@ -42,7 +42,8 @@ def detectable_sizes(exam: Examination) -> dict[str, tuple[float, float]]:
         best = np.maximum(largest(begin, middle), later.result())
     needed = required_noncentrality(exam.pipeline.bank.n, baseline.thresholds.statistic)
     smallest = {
-        name: float(np.sqrt(needed / one)) if one > 0.0 else np.inf for name, one in zip(promised, best, strict=True)
+        name: float(np.sqrt(needed / bound)) if bound > 0.0 else np.inf
+        for name, bound in zip(promised, best, strict=True)
     }
     if exam.pressures is not None:
         for name, size in exam.pressures.model.detectable_changes.items():
@@ -90,8 +91,8 @@ def estimate_warnings(exam: Examination) -> list[DiagnosisWarning]:
         last = int(e.index[int(np.searchsorted(e.updates, e.updates[-1]))])
         if t[-1] - t[last] > exam.baseline.loop.monitor.memory:
             from_s, to_s, count = float(t[last]), float(t[-1]), len(t) - last
-            rest = message("warning.rest")
-            warnings.append(DiagnosisWarning(kind="rest", from_s=from_s, to_s=to_s, count=count, description=rest))
+            at_rest = message("warning.rest")
+            warnings.append(DiagnosisWarning(kind="rest", from_s=from_s, to_s=to_s, count=count, description=at_rest))
     return warnings
 
 

@@ -125,13 +125,13 @@ def _stretches(
     """Return covariates (m, k), coefficients (m, n) and their covariances (m, n, n) of all stretches."""
     length = round(STRETCH * pipeline.loop.monitor.memory * pipeline.loop.sample_rate)
     longest = max(rec.samples for rec in recordings)
-    found = _stretches_of(length, recordings, regressions, fit, names)
-    while not found and length < longest:  # between rests, at a low cutoff, few samples of a stretch count
+    stretches = _stretches_of(length, recordings, regressions, fit, names)
+    while not stretches and length < longest:  # between rests, at a low cutoff, few samples of a stretch count
         length = min(2 * length, longest)
-        found = _stretches_of(length, recordings, regressions, fit, names)
-    if not found:
+        stretches = _stretches_of(length, recordings, regressions, fit, names)
+    if not stretches:
         raise NotEnoughError(f"no stretch of {length} samples with {', '.join(names)}: record longer")
-    c, theta, covariance = (np.array(one) for one in zip(*found, strict=True))
+    c, theta, covariance = (np.array(column) for column in zip(*stretches, strict=True))
     return c, theta, covariance
 
 
@@ -143,7 +143,7 @@ def _stretches_of(
     names: Sequence[str],
 ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
     """Return covariates (k,), coefficients (n,) and their covariance (n, n) of each stretch of `length` samples."""
-    found = []
+    stretches = []
     for rec, g in zip(recordings, regressions, strict=True):
         columns = np.column_stack([rec.channels[name] for name in names])
         for first in range(0, max(rec.samples - length, 0) + 1, length):
@@ -155,8 +155,8 @@ def _stretches_of(
             if not part.phi[part.ok].any(axis=0).all():  # a motion that never asks for a coefficient
                 continue
             theta = least_squares(part)
-            found.append((np.nanmean(c, axis=0), theta, coloured_covariance(part, fit.tuning)))
-    return found
+            stretches.append((np.nanmean(c, axis=0), theta, coloured_covariance(part, fit.tuning)))
+    return stretches
 
 
 def at_origin(

@@ -274,8 +274,8 @@ class Examination:
                 return 0
             estimating, Psi = EstimationRunner(pipeline, tuning), np.eye(len(tuning.theta))[None]
             for rows in outofcore.iter_chunks(learning, end):
-                found = estimating.advance(self.recording.rows(rows)).Psi
-                Psi = found if len(found) else Psi
+                responses = estimating.advance(self.recording.rows(rows)).Psi
+                Psi = responses if len(responses) else Psi
             if np.abs(Psi[-1] * tuning.scale[:, None] / tuning.scale).max() <= FORGOTTEN_SHARE:
                 return first
             memories *= 2.0
@@ -308,16 +308,16 @@ class Examination:
     def _collect(self, at: slice, first: int, advance: Callable[[slice], FloatArray]) -> FloatArray:
         """Return the output of a recursion at some evaluations; it starts at sample `first`."""
         every, n = self.pipeline.every, len(self.tuning.theta)
-        found = np.empty((0, n))
+        values = np.empty((0, n))
         k = first // every - at.start
         for rows in outofcore.iter_chunks(first, at.stop * every):
             piece = advance(rows)
-            if not len(found):
-                found = outofcore.empty((at.stop - at.start, *piece.shape[1:]))
-            found[max(k, 0) : max(k + len(piece), 0)] = piece[max(-k, 0) :]
+            if not len(values):
+                values = outofcore.empty((at.stop - at.start, *piece.shape[1:]))
+            values[max(k, 0) : max(k + len(piece), 0)] = piece[max(-k, 0) :]
             k += len(piece)
-            outofcore.release(found, *self.recording.columns)
-        return found
+            outofcore.release(values, *self.recording.columns)
+        return values
 
 
 def _reference_piece(recording: Recording, rows: slice, first: int) -> ReferencePath:

@@ -172,7 +172,8 @@ def choose_layout(loop: Loop, recordings: Sequence[Recording]) -> FeatureLayout:
     first = 1 if whole >= 3.0 else 0  # start-up is unlike what follows, where anything follows
     speed = np.concatenate([np.abs(_speed(recording)) for recording in recordings])
     powers = [
-        float(np.mean([np.var(x) for x in each])) for each in zip(*((r.u, r.r - r.y) for r in recordings), strict=True)
+        float(np.mean([np.var(x) for x in values]))
+        for values in zip(*((r.u, r.r - r.y) for r in recordings), strict=True)
     ]
     top = MAX_FREQUENCY_SHARE * rate
     return FeatureLayout(
@@ -201,8 +202,8 @@ def _speed(recording: Recording) -> FloatArray:
 
 def _period(recordings: Sequence[Recording]) -> int:
     """Return the period of the reference that all recordings share [samples]; 0 where there is none."""
-    found = {_period_of(recording) for recording in recordings}
-    return found.pop() if len(found) == 1 else 0
+    periods = {_period_of(recording) for recording in recordings}
+    return periods.pop() if len(periods) == 1 else 0
 
 
 def _period_of(recording: Recording) -> int:

@@ -45,15 +45,15 @@ def _describe_quantities(exam: Examination, at: int) -> tuple[Message, ...]:
     """Return the quantities that are outside, each with its value and with what the baseline holds."""
     seen = exam.baseline.limited_motion
     assert exam.motion is not None and seen is not None
-    one, unit = slice(at, at + 1), exam.baseline.plant.units[0]
-    excess, (values, _) = exam.motion.excess(seen, one)[0], exam.motion.quantities(one)
+    row, unit = slice(at, at + 1), exam.baseline.plant.units[0]
+    excess, (values, _) = exam.motion.excess(seen, row)[0], exam.motion.quantities(row)
     worst = float(np.abs(excess).max())
-    found = []
+    findings = []
     for k in np.flatnonzero(np.abs(excess) >= min(UNSEEN_EXCESS, worst)):
         least, most = (np.array(x)[:, 1, k] for x in (seen.least, seen.most))
         y = values[0, :, 1, k]
         window = int(np.argmax(y / most if excess[k] > 0.0 else -y / np.maximum(least, np.finfo(np.float64).tiny)))
-        found.append(
+        findings.append(
             message(
                 f"motion.{QUANTITIES[k]}",
                 value=float(y[window]),
@@ -62,7 +62,7 @@ def _describe_quantities(exam: Examination, at: int) -> tuple[Message, ...]:
                 unit=unit or "y",
             )
         )
-    return tuple(found)
+    return tuple(findings)
 
 
 def _describe_saturation(exam: Examination) -> Message | None:

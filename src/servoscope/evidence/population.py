@@ -152,14 +152,14 @@ class Population:
         return self.ratios.names, *self.ratios.combine(x, C, PRIOR_STD)
 
 
-def _common_scatter(each: Sequence[Baseline], n: int) -> tuple[FloatArray, float]:
+def _common_scatter(baselines: Sequence[Baseline], n: int) -> tuple[FloatArray, float]:
     """Return the covariance between recordings that machines have in common, (n, n), and its degrees of freedom.
 
     These are what is left of all of theirs where machines scatter by different amounts: variances that scatter among
     machines with a coefficient of variation c come from an inverse gamma law of 4 + 2/c^2 degrees (by moments). The
     correlations between coefficients are shrunk towards none (oracle approximating shrinkage).
     """
-    known = [baseline for baseline in each if baseline.scatter.between]
+    known = [baseline for baseline in baselines if baseline.scatter.between]
     if len(known) < MIN_MACHINES:
         return np.zeros((n, n)), 0.0
     degrees = np.array([len(baseline.sources) - 1.0 for baseline in known])
@@ -193,11 +193,12 @@ def _estimation_error(baseline: Baseline, scatter: FloatArray) -> FloatArray:
     return np.asarray(noise + scatter / m)
 
 
-def _ratios(each: Sequence[Baseline]) -> NormalPrior | None:
-    names = tuple(each[0].healthy.ratios)
+def _ratios(baselines: Sequence[Baseline]) -> NormalPrior | None:
+    names = tuple(baselines[0].healthy.ratios)
     if not names or any(
-        tuple(baseline.healthy.ratios) != names or len(baseline.healthy.covariance) != len(names) for baseline in each
+        tuple(baseline.healthy.ratios) != names or len(baseline.healthy.covariance) != len(names)
+        for baseline in baselines
     ):
         return None
-    values = np.log([[baseline.healthy.ratios[name] for name in names] for baseline in each])
-    return NormalPrior.from_machines(names, values, np.array([baseline.healthy.covariance for baseline in each]))
+    values = np.log([[baseline.healthy.ratios[name] for name in names] for baseline in baselines])
+    return NormalPrior.from_machines(names, values, np.array([baseline.healthy.covariance for baseline in baselines]))

@@ -139,9 +139,9 @@ def find_corrections(
     if not best * (HEALTHY_RESIDUAL_RATIO if explained else MIN_RESIDUAL_RATIO) < share:
         yield from _reference_corrections(rows)
         return
-    near = [correction for correction, (each, _) in tried.items() if each < 2.5 * best]
+    near = [correction for correction, (power, _) in tried.items() if power < 2.5 * best]
     if residual_power:
-        near.sort(key=lambda one: abs(np.log(max(tried[one][1], 1e-300) / residual_power)))
+        near.sort(key=lambda similar: abs(np.log(max(tried[similar][1], 1e-300) / residual_power)))
     spreads = _spread(rows.r), _spread(rows.y)
     opposed = min(spreads) > 0.0 and float(np.corrcoef(rows.r, rows.y)[0, 1]) < 0.0
     for correction in near:
@@ -161,9 +161,9 @@ def begins_wrong(pipeline: Pipeline, theta: FloatArray, recording: Recording, co
     if correction.factors[1:] == (1.0, 1.0) and correction.order == (0, 1, 2):
         return True  # r in another unit, which the plant does not notice
     rows = _beginning(pipeline, recording)
-    found = correction.apply(rows)
+    corrected = correction.apply(rows)
     before, _ = _residual_share(pipeline, theta, rows, BEGINNING_SHARE)
-    after, _ = _residual_share(pipeline, theta, found, BEGINNING_SHARE)
+    after, _ = _residual_share(pipeline, theta, corrected, BEGINNING_SHARE)
     return after * HEALTHY_RESIDUAL_RATIO < before
 
 
@@ -195,7 +195,7 @@ def _single_corrections() -> Iterator[Correction]:
     for order in ((2, 1, 0), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1)):
         yield Correction(order=order)
     yield Correction(factors=(1.0, 1.0, -1.0))
-    for factor in (*FACTORS, *(1.0 / each for each in FACTORS)):
+    for factor in (*FACTORS, *(1.0 / inverse for inverse in FACTORS)):
         yield Correction(factors=(1.0, 1.0, factor))
         yield Correction(factors=(1.0, factor, 1.0))
 
@@ -205,7 +205,7 @@ def _reference_corrections(rows: Recording) -> Iterator[Correction]:
     spreads = _spread(rows.r), _spread(rows.y)
     if min(spreads) > 0.0:
         ratio = spreads[1] / spreads[0]
-        for factor in (*FACTORS, *(1.0 / each for each in FACTORS)):
+        for factor in (*FACTORS, *(1.0 / inverse for inverse in FACTORS)):
             if abs(ratio / factor - 1.0) < UNIT_ERROR:
                 yield Correction(factors=(factor, 1.0, 1.0))
 

@@ -60,7 +60,7 @@ def fit_warm_up(
 
 def _principal_direction(sums: Sequence[BlockSums], fit: TuningFit) -> tuple[FloatArray, CovariateModel]:
     """Return the coefficients in the middle of what the stretches show, and a straight line through them."""
-    found, whose = [], []
+    estimates, whose = [], []
     for i, block_sums in enumerate(sums):
         blocks = max(round(STRETCH / BLOCK_MEMORIES), 1)
         for first in range(0, len(block_sums.first) - blocks + 1, blocks):
@@ -69,12 +69,12 @@ def _principal_direction(sums: Sequence[BlockSums], fit: TuningFit) -> tuple[Flo
                 block_sums.moment[first : first + blocks].sum(axis=0),
             )
             if np.linalg.matrix_rank(A / np.sqrt(np.outer(np.diag(A), np.diag(A)))) == len(A):
-                found.append((solve_scaled(A, b), A))
+                estimates.append((solve_scaled(A, b), A))
                 whose.append(i)
-    if len(found) < 3:
+    if len(estimates) < 3:
         raise NotEnoughError("too short to show what a warm-up does: record longer, from a cold start on")
-    theta, A = (np.array(column) for column in zip(*found, strict=True))
-    std = np.sqrt(fit.tuning.R * np.array([np.diag(np.linalg.inv(one)) for one in A]))
+    theta, A = (np.array(column) for column in zip(*estimates, strict=True))
+    std = np.sqrt(fit.tuning.R * np.array([np.diag(np.linalg.inv(information)) for information in A]))
     proportional = (np.sign(theta) == np.sign(theta[0])).all(axis=0) & (
         np.abs(theta) > MIN_PROPORTIONAL_STDS * std
     ).all(axis=0)
@@ -117,19 +117,19 @@ def _with_time_constant(
         return sum(fit_course(block_sums, made(log_s), theta, model).cost for block_sums in sums)
 
     tried = np.linspace(np.log(sums[0].seconds), np.log(MAX_DURATIONS * duration_s), TIME_CONSTANT_GRID_SIZE)
-    best = int(np.argmin([cost(one) for one in tried]))
+    best = int(np.argmin([cost(constant) for constant in tried]))
     bounds = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
     return made(float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 0.01}).x))
 
 
 def _variance(sums: Sequence[BlockSums], courses: Sequence[WarmUpFit]) -> float:
     """Return the variance of eta's residual that sums over blocks show, whatever its colour within them."""
-    each = [
+    parts = [
         np.trace(np.linalg.solve(block_sums.normal.sum(axis=0), fit.residual.T @ fit.residual))
         / block_sums.moment.shape[1]
         for block_sums, fit in zip(sums, courses, strict=True)
     ]
-    return float(np.mean(each))
+    return float(np.mean(parts))
 
 
 def changes_like_warmth(exam: Examination) -> dict[str, float]:
@@ -140,12 +140,12 @@ def changes_like_warmth(exam: Examination) -> dict[str, float]:
     c = along.averages[exam.estimates.index[last]]
     step = 0.5 * (np.array(along.model.high) - np.array(along.model.low))
     warmth = (along.model.theta(along.theta, c + 1e-3 * step) - along.model.theta(along.theta, c - 1e-3 * step)) / 2e-3
-    found = {}
+    slopes = {}
     for name, d in exam.baseline.fault_directions.items():
         known_d, known_w = np.linalg.solve(exam.covariance(last), np.stack([d, warmth], axis=1)).T
         if float(d @ known_w) ** 2 >= MIN_SQUARED_COSINE * float(d @ known_d) * float(warmth @ known_w):
-            found[name] = 2.0 * abs(float(d @ known_w)) / float(d @ known_d)
-    return found
+            slopes[name] = 2.0 * abs(float(d @ known_w)) / float(d @ known_d)
+    return slopes
 
 
 def _judge(exam: Examination) -> Iterator[Finding]:

@@ -121,9 +121,9 @@ def _move_rows(monitor: CovariateMonitor, rows: FloatArray, averages: FloatArray
     Where they are not known, or outside of what was learned, there are no updates.
     """
     n = len(expected)
-    moved, more, known = monitor.expect(averages)
+    moved, covariates, known = monitor.expect(averages)
     covariance = rows[:, 4 + n : 4 + n + n * n]
-    covariance += more.reshape(len(rows), -1)
+    covariance += covariates.reshape(len(rows), -1)
     T2 = t2_statistic(rows[:, 4 : 4 + n], expected + moved, covariance.reshape(-1, n, n))
     rows[:, 1] = np.where((rows[:, 0] > 0.0) & known, T2, 0.0)
     rows[:, 0] = np.where(known, rows[:, 0], 0.0)

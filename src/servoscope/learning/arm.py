@@ -201,11 +201,11 @@ def _learn_scatter(
             block_information(signal.t, *weighted(signal, X, e, weight))
             for signal, X, e in zip(signals, columns, residuals, strict=True)
         ]
-        changes = [_change(one, moves) for one in whole]
+        changes = [_change(information, moves) for information in whole]
         between = random_effect(changes, scale, BETWEEN_SHARE)
         own = [np.linalg.solve(A + np.diag(between**-2.0), g) for A, g in changes]
         left = [e - np.einsum("jdm,d->jm", X[:, moves], d) for X, e, d in zip(columns, residuals, own, strict=True)]
-    halves = [second_half(one.part(moves), np.diag(between**-2.0)) for one in whole]
+    halves = [second_half(information.part(moves), np.diag(between**-2.0)) for information in whole]
     return _Scatter(inflation, whole, scale, between, random_effect(halves, scale, DRIFT_SHARE))
 
 
@@ -220,16 +220,16 @@ def _judge_each(
     """Return what the evidence for a change reaches in healthy recordings, each judged by the others, and notes."""
     several = len(recordings) >= MIN_RECORDINGS
     false_alarms, typical = model.loop.false_alarms, np.median(scatter.inflation)
-    moves, rest = slice(len(fit.theta), None), slice(len(fit.theta))
-    changes = [_change(one, moves) for one in scatter.information]
+    moves, fixed = slice(len(fit.theta), None), slice(len(fit.theta))
+    changes = [_change(information, moves) for information in scatter.information]
     limits, notes = list[float](), list[Message]()
-    for i, one in enumerate(scatter.information):
+    for i, information in enumerate(scatter.information):
         others = random_effect(changes[:i] + changes[i + 1 :], scatter.scale, BETWEEN_SHARE)
         prior = np.zeros((len(fit.theta) + scatter.scale.size,) * 2)
         known = (fit.A.sum(0) + fit.prior - several * fit.A[i]) / typical
-        prior[rest, rest] = loosen(known, coefficient_names(model), fit.theta)
+        prior[fixed, fixed] = loosen(known, coefficient_names(model), fit.theta)
         prior[moves, moves] = np.diag((others if several else scatter.between) ** -2.0)
-        test = ChangeTest(one, prior, arm_causes(model), scatter.scale, scatter.drift)
+        test = ChangeTest(information, prior, arm_causes(model), scatter.scale, scatter.drift)
         if i == len(recordings) // 2:
             limits.append(test.healthy_limit(false_alarms))
         if several:
@@ -262,8 +262,8 @@ def _fit(model: ArmModel, signals: Sequence[ArmSignals], designs: Sequence[Float
     prior = np.zeros((start.size, start.size))
     size = model.base.size
     prior[range(size.size), range(size.size)] = size**-2.0
-    rest = np.arange(size.size, start.size)
-    prior[rest, rest] = MAX_COEFFICIENT**-2.0
+    further = np.arange(size.size, start.size)
+    prior[further, further] = MAX_COEFFICIENT**-2.0
     load = len(model.names) + np.arange(model.arm.size)
     prior[load, load] = (MAX_LOAD_FRICTION if model.loop.load_friction else NO_LOAD_FRICTION) ** -2.0
     moving = np.concatenate([signal.moving for signal in signals], axis=1)
@@ -336,11 +336,11 @@ def _inflation(
 def _undetermined(model: ArmModel, theta: FloatArray, std: FloatArray) -> list[str]:
     """Return the friction terms that the motion leaves open; those of a joint together are what counts."""
     names = coefficient_names(model)
-    found = []
+    undetermined = []
     for joint in model.arm.names:
         viscous, coulomb = (names.index(f"{joint}.{what}") for what in ("viscous_friction", "coulomb_friction"))
-        found += [names[i] for i in (viscous, coulomb) if std[i] > MAX_FRICTION_STD * abs(theta[i])]
-    return found
+        undetermined += [names[i] for i in (viscous, coulomb) if std[i] > MAX_FRICTION_STD * abs(theta[i])]
+    return undetermined
 
 
 def _mounting_notes(

@@ -110,16 +110,16 @@ def _columns_by_joint(names: Sequence[str], arm: Kinematics) -> dict[str, tuple[
 def _choose(
     columns: dict[str, tuple[str, ...]],
     words: re.Pattern[str],
-    more: re.Pattern[str] | None = None,
+    second: re.Pattern[str] | None = None,
     unlike: Sequence[re.Pattern[str]] | None = None,
 ) -> tuple[str, ...] | None:
-    """Return the columns whose common name has one of the words, of `more` too, and none of `unlike`; None without.
+    """Return the columns whose common name has one of the words, of `second` too, and none of `unlike`; None without.
 
     `unlike`: without it, of what is not measured, and of velocities but for them.
     """
     unlike = unlike or [pattern for pattern in (ASKED_FOR, VELOCITY, ERROR) if pattern is not words]
     for what, group in columns.items():
-        if all(p.search(what.lower()) for p in (words, more or words)) and not any(
+        if all(p.search(what.lower()) for p in (words, second or words)) and not any(
             p.search(what.lower()) for p in unlike
         ):
             return group

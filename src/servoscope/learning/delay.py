@@ -38,7 +38,7 @@ def check_delay(
 
     The delay is None where the recordings do not show it; the messages are warnings. `accept` turns a refusal into one.
     """
-    recording = max(recordings, key=lambda each: each.samples)
+    recording = max(recordings, key=lambda candidate: candidate.samples)
     g = model_order.form_regressors(recording, loop)
     to_rad = 2.0 * np.pi * filter_cutoff(loop)  # at the cutoff
     regression = _regression_delay(loop, recording, g)

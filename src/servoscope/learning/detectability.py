@@ -74,20 +74,20 @@ def learn_detectability(
     ), notes
 
 
-def forecast_changes(baseline: Baseline, more: int) -> dict[str, tuple[float, float]]:
-    """Return the smallest detectable changes now and with `more` recordings like those before, by fault.
+def forecast_changes(baseline: Baseline, further: int) -> dict[str, tuple[float, float]]:
+    """Return the smallest detectable changes now and with `further` recordings like those before, by fault.
 
     With forgetting, theta_hat has the covariance P_d/2; what is not detected now is left out.
     """
     S, directions = np.array(baseline.recursion.P_d) / 2.0, baseline.fault_directions
-    before, after = baseline.covariance_after(np.array(np.inf)), forecast_covariance(baseline, more)
-    found = {}
+    before, after = baseline.covariance_after(np.array(np.inf)), forecast_covariance(baseline, further)
+    changes = {}
     for change in baseline.detectability.changes:
         d = directions[change.parameter]
         if change.change is not None:
             gain = (d @ solve_scaled(S + before, d)) / (d @ solve_scaled(S + after, d))
-            found[change.name] = change.change, change.change * float(np.sqrt(gain))
-    return found
+            changes[change.name] = change.change, change.change * float(np.sqrt(gain))
+    return changes
 
 
 def _smallest_change(changes: Sequence[DetectableChange]) -> tuple[float, str]:

@@ -71,31 +71,31 @@ def learn_instrument(
     return estimate, []
 
 
-def _is_biased(found: InstrumentalFit, fit: TuningFit, recordings: Sequence[Recording]) -> bool:
+def _is_biased(instrumental: InstrumentalFit, fit: TuningFit, recordings: Sequence[Recording]) -> bool:
     """Return whether noise in y makes least squares miss a coefficient of a power of s, by enough to matter.
 
     Both estimates have to differ by more than chance, and the noise has to be there: what friction and elasticity leave
     unexplained also moves them apart, and neither is then the right one.
     """
-    powers = slice(0, len(found.pipeline.loop.plant.powers))
-    theta, std = found.fit.tuning.theta[powers], np.sqrt(np.diag(found.fit.covariance))[powers]
+    powers = slice(0, len(instrumental.pipeline.loop.plant.powers))
+    theta, std = instrumental.fit.tuning.theta[powers], np.sqrt(np.diag(instrumental.fit.covariance))[powers]
     apart = np.abs(fit.tuning.theta[powers] - theta)
-    of_noise = np.abs(_attenuation(found, recordings)[powers])
+    of_noise = np.abs(_attenuation(instrumental, recordings)[powers])
     significant = (apart > MIN_BIAS_STDS * std) & (apart > MIN_RELATIVE_BIAS * np.abs(theta))
     return bool(np.any(significant & (of_noise > MIN_NOISE_SHARE * apart)))
 
 
-def _attenuation(found: InstrumentalFit, recordings: Sequence[Recording]) -> FloatArray:
+def _attenuation(instrumental: InstrumentalFit, recordings: Sequence[Recording]) -> FloatArray:
     """Return what white noise of y, as loud as its roughness says, takes from least squares, shape (n,).
 
     Least squares are off by -R_phi^-1 S theta, S the covariance of the noise in phi (errors in variables; Soderstrom,
     2007). Motion is smooth, so that differences of a high order leave little but noise.
     """
-    phi = np.vstack([g.phi[g.ok] for g in found.regressions])
+    phi = np.vstack([g.phi[g.ok] for g in instrumental.regressions])
     rough = np.concatenate([np.diff(part.y, DIFFERENCES) for rec in recordings for part in unbroken(rec)])
     variance = float(np.mean(rough**2)) / math.comb(2 * DIFFERENCES, DIFFERENCES) if len(rough) else 0.0
-    S = variance * noise_moments(found.pipeline.bank)
-    return solve_scaled(phi.T @ phi / len(phi), S @ found.fit.tuning.theta)
+    S = variance * noise_moments(instrumental.pipeline.bank)
+    return solve_scaled(phi.T @ phi / len(phi), S @ instrumental.fit.tuning.theta)
 
 
 def noise_moments(bank: FilterBank) -> FloatArray:

@@ -42,7 +42,7 @@ def learn_pressures(healthy: HealthyRecordings) -> PressureModel | None:
 
 
 def _model(layout: PressureLayout, sums: Sequence[Sums]) -> PressureModel:
-    parts = np.array([[layout.coefficients(half) for half in halves(each)] for each in sums])
+    parts = np.array([[layout.coefficients(half) for half in halves(blocks)] for blocks in sums])
     known = ~np.isnan(parts)
     never = ~known.any(axis=(0, 1))  # no recording asks for it, and none will be judged by it
     theta = np.where(known, parts, 0.0).sum(axis=(0, 1)) / np.maximum(known.sum(axis=(0, 1)), 1)
@@ -56,5 +56,5 @@ def _model(layout: PressureLayout, sums: Sequence[Sums]) -> PressureModel:
         theta=tuple(theta.tolist()),
         halves=to_tuples(further_covariance(left, len(sums))),
         shifts=tuple(shifts.tolist()),
-        rows=float(np.mean([each[-1][:, 0, 0].sum() for each in sums])),
+        rows=float(np.mean([blocks[-1][:, 0, 0].sum() for blocks in sums])),
     )

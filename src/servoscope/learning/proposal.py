@@ -383,7 +383,7 @@ def _column_lines(path: Path, columns: Columns, wraps: Mapping[str, float], reco
         lines.append(ProposalLine("columns", "resample", "true", message("init.resample", how=how)))
     if columns.text is not None:
         given = columns.text.model_dump(exclude_defaults=True)
-        value = ", ".join(f"{key} = {json.dumps(each, ensure_ascii=False)}" for key, each in given.items())
+        value = ", ".join(f"{key} = {json.dumps(setting, ensure_ascii=False)}" for key, setting in given.items())
         lines.append(ProposalLine("columns", "text", f"{{{value}}}", message("init.layout")))
     return lines
 

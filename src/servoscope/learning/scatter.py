@@ -92,8 +92,8 @@ def carry_scatter(earlier: Baseline, theta: FloatArray) -> FloatArray:
     return np.asarray(variances * ratios**2)
 
 
-def forecast_covariance(baseline: Baseline, more: int) -> FloatArray:
-    """Return the covariance (n, n) to expect of a baseline that learns `more` recordings like those before.
+def forecast_covariance(baseline: Baseline, further: int) -> FloatArray:
+    """Return the covariance (n, n) to expect of a baseline that learns `further` recordings like those before.
 
     What is not scatter is noise of the mean, which falls with their number; the scatter is predicted the better, the
     more recordings show it.
@@ -108,7 +108,7 @@ def forecast_covariance(baseline: Baseline, more: int) -> FloatArray:
         return np.maximum(scatter, carried) if count < known.carried_from else scatter
 
     noise = np.maximum(np.diag(C) - ahead(m), MIN_NOISE_SHARE * np.diag(C))
-    scale = np.sqrt((noise * m / (m + more) + ahead(m + more)) / np.diag(C))
+    scale = np.sqrt((noise * m / (m + further) + ahead(m + further)) / np.diag(C))
     return np.asarray(C * np.outer(scale, scale))  # with the correlations that there are: it stays positive definite
 
 

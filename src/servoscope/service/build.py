@@ -108,7 +108,9 @@ def resume_assets(
         asset, blocks = assets[name], [Block.unpack(name, *sample) for sample in samples]
         if name in restarted and name in rows:
             position = StreamPosition(**rows[name]["status"]["counted"])
-            for block in blocks[bisect.bisect_left(blocks, position.blocks, key=lambda one: one.sequence) :]:
+            for block in blocks[
+                bisect.bisect_left(blocks, position.blocks, key=lambda candidate: candidate.sequence) :
+            ]:
                 position = position.skip(block.t, block.pack())
             asset.begin(position)
             behind.add(name)
@@ -155,12 +157,12 @@ def open_source(config: ServiceFile, name: str, source: Inbox, assets: Mapping[s
 
 def resume_positions(config: ServiceFile, source: str, assets: Mapping[str, Asset]) -> dict[str, ResumePosition]:
     """Return where the assets of a source, by its name, go on."""
-    found = {}
+    inboxes = {}
     for name, asset in assets.items():
         if config.assets[name].source == source and asset.state is not None and asset.heard:
             position = asset.state.position
-            found[name] = ResumePosition(position.sequence, position.began, position.stream, position.t)
-    return found
+            inboxes[name] = ResumePosition(position.sequence, position.began, position.stream, position.t)
+    return inboxes
 
 
 def build_assets(config: ServiceFile) -> dict[str, Asset]:
@@ -210,9 +212,12 @@ def build_assets(config: ServiceFile) -> dict[str, Asset]:
     _check_names("[prognosis] limits", "fault", config.prognosis.limits, known)
     for asset in {id(asset.baseline): asset for asset in assets.values()}.values():
         asset.compile_kernels()
-    kinds = {monitor.lane_key or one.loop.plant.kind: one for one, monitor in shared.values()}
-    for one in kinds.values():
-        compile_examination(one)  # one of each kind: its kernels are those of all others
+    kinds = {
+        monitor.lane_key or shared_baseline.loop.plant.kind: shared_baseline
+        for shared_baseline, monitor in shared.values()
+    }
+    for shared_baseline in kinds.values():
+        compile_examination(shared_baseline)  # one of each kind: its kernels are those of all others
     return assets
 
 
@@ -283,18 +288,18 @@ def _resolve_limits(baseline: AnyBaseline, limits: Mapping[str, float | LimitKin
 
 def source_assets(config: ServiceFile, assets: Mapping[str, Asset], source: str) -> dict[str, SourceAsset]:
     """Return what a source is told of its assets."""
-    key, found = config.sources[source].asset_key, dict[str, SourceAsset]()
+    key, sources = config.sources[source].asset_key, dict[str, SourceAsset]()
     for name, asset in config.assets.items():
         if asset.source == source:
             baseline, address = assets[name].baseline, getattr(asset, key) if key else None
-            found[name] = SourceAsset(
+            sources[name] = SourceAsset(
                 baseline.loop.carrier if isinstance(baseline, ArmBaseline) else baseline.loop,
                 address,
                 config.service.ahead_s,
                 baseline.logged_covariates,
                 is_arm=isinstance(baseline, ArmBaseline),
             )
-    return found
+    return sources
 
 
 def build_source(config: ServiceFile, assets: Mapping[str, Asset], name: str) -> Inbox:

@@ -62,14 +62,14 @@ def find_axis_change(baseline: Baseline, recording: Recording) -> AxisChange | N
     return None
 
 
-def _named_change(window: AxisWindow, found: _ChangeFit, limit: float, enough: float) -> AxisChange | None:
+def _named_change(window: AxisWindow, change: _ChangeFit, limit: float, enough: float) -> AxisChange | None:
     """Return the likeliest change, of a coefficient above `limit` or of the vibration above `enough`; None: neither."""
     # the larger likelihood ratio has the name: a rattling load moves coefficients a little, and a new mass rings
-    vibration = find_vibration(window, found.healthy.residual, max(found.gain, enough))
-    if vibration is None and found.gain <= limit:
+    vibration = find_vibration(window, change.healthy.residual, max(change.gain, enough))
+    if vibration is None and change.gain <= limit:
         return None
-    onset = found.changed.profile.onset
-    told = vibration.detected if vibration else max(found.detection(window, limit), onset)
+    onset = change.changed.profile.onset
+    told = vibration.detected if vibration else max(change.detection(window, limit), onset)
     ends = vibration.onset if vibration else (onset, onset, onset)
     low, at, high = (window.first_sample + window.stride * k for k in ends)
     within = vibration and replace(vibration, onset=(low, at, high))

@@ -179,39 +179,39 @@ class HypothesisEvidence:
 
 
 def integrate_evidence(
-    window: ChangeWindow, found: HypothesisFit, scales: Sequence[SizePrior], noise_variance: float
+    window: ChangeWindow, fitted: HypothesisFit, scales: Sequence[SizePrior], noise_variance: float
 ) -> HypothesisEvidence:
     """Integrate likelihood times prior over the sizes.
 
     One fault: along its size, with the healthy parameters following linearly. Two: a Gaussian around the most likely
     sizes (Laplace; MacKay, 2003, chapter 27), of which no more than the whole prior can be inside.
     """
-    m, k = window.nuisance_count, len(found.x)
-    H = found.jacobian.T @ found.jacobian / noise_variance
+    m, k = window.nuisance_count, len(fitted.x)
+    H = fitted.jacobian.T @ fitted.jacobian / noise_variance
     nuisance = H[:m, :m]
     volume = -0.5 * float(np.linalg.slogdet(nuisance)[1]) if m else 0.0
     if k == 1:
-        return _evidence_along_size(window, found, scales[0], noise_variance, volume)
-    log = volume - 0.5 * found.cost / noise_variance
-    C = noise_variance * found.covariance
+        return _evidence_along_size(window, fitted, scales[0], noise_variance, volume)
+    log = volume - 0.5 * fitted.cost / noise_variance
+    C = noise_variance * fitted.covariance
     # each direction's share of the prior is at most all of it
     conditional = float(np.linalg.slogdet(C)[1]) / 2.0 + k * np.log(2.0 * np.pi) / 2.0
-    priors = sum(float(scale.log_density(np.array(x))) for scale, x in zip(scales, found.x, strict=True))
-    return HypothesisEvidence(log + min(conditional + priors, 0.0), found.intervals(noise_variance))
+    priors = sum(float(scale.log_density(np.array(x))) for scale, x in zip(scales, fitted.x, strict=True))
+    return HypothesisEvidence(log + min(conditional + priors, 0.0), fitted.intervals(noise_variance))
 
 
 def _evidence_along_size(
-    window: ChangeWindow, found: HypothesisFit, scale: SizePrior, noise_variance: float, volume: float
+    window: ChangeWindow, fitted: HypothesisFit, scale: SizePrior, noise_variance: float, volume: float
 ) -> HypothesisEvidence:
     m = window.nuisance_count
-    (low,), (high,) = log_ratio_bounds(found.faults)
-    best = float(found.x[0])
-    reach = min(SIZE_STDS * float(np.sqrt(found.covariance[0, 0] * noise_variance)), high - low)
+    (low,), (high,) = log_ratio_bounds(fitted.faults)
+    best = float(fitted.x[0])
+    reach = min(SIZE_STDS * float(np.sqrt(fitted.covariance[0, 0] * noise_variance)), high - low)
     sizes = np.unique(np.clip(best + reach * np.linspace(-1.0, 1.0, POINTS), low, high))
-    H = found.jacobian.T @ found.jacobian
+    H = fitted.jacobian.T @ fitted.jacobian
     follow = -np.linalg.solve(H[:m, :m], H[:m, m]) if m else np.zeros(0)
-    z = np.column_stack([found.d + np.outer(sizes - best, follow), sizes])
-    J = (window.residuals(z, found.names, found.profile) ** 2).sum(axis=1)
+    z = np.column_stack([fitted.d + np.outer(sizes - best, follow), sizes])
+    J = (window.residuals(z, fitted.names, fitted.profile) ** 2).sum(axis=1)
     log_weight = -0.5 * J / noise_variance + scale.log_density(sizes)
     found_at = Posterior.from_log_density(sizes, log_weight)
     return HypothesisEvidence(volume + found_at.log_area, (found_at.interval,))

@@ -146,7 +146,7 @@ class _HypothesisSearch:
         return self._weigh(everything, estimate)
 
     def _sharpen_onset(
-        self, found: OnsetEstimate, fitted: Sequence[HypothesisFit]
+        self, estimate: OnsetEstimate, fitted: Sequence[HypothesisFit]
     ) -> tuple[OnsetEstimate, list[HypothesisFit]]:
         """Move the onset of a loud step sample by sample: its sizes do not follow linearly from one to the next."""
         best = self._update_noise_variance(fitted)
@@ -158,9 +158,10 @@ class _HypothesisSearch:
                         break
                     best = moved
         profile = best.profile
-        if profile == found.profile:
-            return found, list(fitted)
-        onset = replace(found, profile=profile, low=min(found.low, profile.onset), high=max(found.high, profile.onset))
+        if profile == estimate.profile:
+            return estimate, list(fitted)
+        low, high = min(estimate.low, profile.onset), max(estimate.high, profile.onset)
+        onset = replace(estimate, profile=profile, low=low, high=high)
         everything = self._refit_contenders([self._refit_at(f, profile) for f in fitted])
         return onset, [best if f.names == best.names else f for f in everything]
 
@@ -172,19 +173,19 @@ class _HypothesisSearch:
         return min(pair, self._fit(pair.faults, np.zeros_like(pair.d), starts), key=lambda fitted: fitted.cost)
 
     def _iterate_onset(
-        self, found: OnsetEstimate, fitted: Sequence[HypothesisFit]
+        self, onset: OnsetEstimate, fitted: Sequence[HypothesisFit]
     ) -> tuple[OnsetEstimate, HypothesisFit]:
         """Find the onset and the sizes of the best hypothesis in turns if it is a pair."""
         best = self._update_noise_variance(fitted)
         for _ in range(MAX_LOOKS if len(best.faults) > 1 else 0):
-            found = self._onset(best)
-            after = self._refit_at(best, found.profile)
+            onset = self._onset(best)
+            after = self._refit_at(best, onset.profile)
             gained, best = best.cost - after.cost, after
             # a pair that is far off at its own onset is not the truth, whatever further looks gain
             if gained < MIN_LOOK_GAIN * self.noise_variance or self._misfit(best) > MAX_PAIR_MISFIT:
                 break
-        self.profile = found.profile
-        return found, best
+        self.profile = onset.profile
+        return onset, best
 
     def _follow_onset(self, fitted: Sequence[HypothesisFit]) -> list[HypothesisFit]:
         """Let all hypotheses follow to the onset that was found."""
@@ -292,9 +293,9 @@ class _HypothesisSearch:
         is_worse = self._refit_at(fitted, estimate.profile).cost > most
         return OnsetEstimate(fitted.profile, begin, begin, estimate.size_std) if is_worse else estimate
 
-    def _weigh(self, fitted: Sequence[HypothesisFit], found: OnsetEstimate) -> RefitResult:
+    def _weigh(self, fitted: Sequence[HypothesisFit], onset: OnsetEstimate) -> RefitResult:
         window, n = self.window, len(self.faults)
-        scales = {fault: SizePrior.from_window(window, fault, found.profile) for fault in self.faults}
+        scales = {fault: SizePrior.from_window(window, fault, onset.profile) for fault in self.faults}
         own = sum(fault.name not in self.rays for fault in self.faults)
         several = PAIR_PRIOR if own > 1 else 0.0
         prior = {1: (1.0 - several - OUTSIDE_PRIOR) / n, 2: several / max(own * (own - 1) / 2, 1)}
@@ -328,7 +329,7 @@ class _HypothesisSearch:
         logs = np.append(logs, np.logaddexp.reduce([nothing, *rivals]))
         probability = np.exp(logs - logs.max())
         probability /= probability.sum()
-        told = [e.widen(f, found.size_std, self.window.size_error) for e, f in zip(told, fitted, strict=True)]
+        told = [e.widen(f, onset.size_std, self.window.size_error) for e, f in zip(told, fitted, strict=True)]
         # by their logarithms: under a change that is unknown all probabilities may vanish
         order = np.argsort(-logs[:-1], kind="stable")
         hypotheses = tuple(Hypothesis(fitted[i], told[i], float(probability[i])) for i in order)
@@ -338,7 +339,7 @@ class _HypothesisSearch:
             tuple(others),
             float(probability[-1]),
             good,
-            found,
+            onset,
             self.noise_variance,
             self.initial_onset,
             self.latest,

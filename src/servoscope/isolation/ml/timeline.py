@@ -165,32 +165,34 @@ class _TimelineSearch:
                 bounds[i] += int(steps[np.argmin([moved(i, int(by)) for by in steps])])
         return PlantSequence(tuple(bounds[:-1]), tuple(plants), cost(bounds[:-1]))
 
-    def _drop_needless(self, found: PlantSequence) -> PlantSequence:
+    def _drop_needless(self, sequence: PlantSequence) -> PlantSequence:
         """Return a sequence in which every stretch is worth its price: else it is that of a neighbour, or healthy."""
-        ends = [*found.starts[1:], self.window.samples]
-        for i, (plant, begin, end) in enumerate(zip(found.plants, found.starts, ends, strict=True)):
+        ends = [*sequence.starts[1:], self.window.samples]
+        for i, (plant, begin, end) in enumerate(zip(sequence.plants, sequence.starts, ends, strict=True)):
             short = bool(i) and end - begin < MIN_STRETCH_SAMPLES
             if not plant.faults and not short:
                 continue
-            others = [HEALTHY, *found.plants[max(i - 1, 0) : i], *found.plants[i + 1 : i + 2]]
+            others = [HEALTHY, *sequence.plants[max(i - 1, 0) : i], *sequence.plants[i + 1 : i + 2]]
             without = min(
                 (
-                    self._place([*zip(found.starts, [*found.plants[:i], other, *found.plants[i + 1 :]], strict=True)])
+                    self._place(
+                        [*zip(sequence.starts, [*sequence.plants[:i], other, *sequence.plants[i + 1 :]], strict=True)]
+                    )
                     for other in others
                     if other is not plant
                 ),
                 key=lambda candidate: candidate.cost,
             )
-            if short or without.cost <= found.cost:
+            if short or without.cost <= sequence.cost:
                 return self._drop_needless(without)
-        return found
+        return sequence
 
-    def _fit_stretches(self, found: PlantSequence) -> Iterator[tuple[int, list[ChangedPlant]]]:
+    def _fit_stretches(self, sequence: PlantSequence) -> Iterator[tuple[int, list[ChangedPlant]]]:
         """Yield the first sample of each stretch and the plants that may explain it, the likeliest first.
 
         Pairs are among them where no fault alone explains it. The ends are left out: they may belong to others.
         """
-        starts = [*found.starts, self.window.samples]
+        starts = [*sequence.starts, self.window.samples]
         long = [(begin, end) for begin, end in pairwise(starts) if end - begin >= self.shortest]
         bounds = sorted({0, self.window.samples, *(k for both in long for k in both)})
         for begin, end in pairwise(bounds):
@@ -212,12 +214,12 @@ class _TimelineSearch:
             starts = [np.append(fit.x, 0.0), np.append(0.0, other.x)]
             yield fit_hypothesis(part, [*fit.faults, *other.faults], FROM_START, self.known, starts, free=False)
 
-    def _explain(self, bounds: Sequence[int], each: Sequence[ChangedPlant]) -> Iterator[TimelineStretch]:
+    def _explain(self, bounds: Sequence[int], plants: Sequence[ChangedPlant]) -> Iterator[TimelineStretch]:
         begins = [(0, 0, 0)]
-        for i in range(1, len(each)):
-            begins.append(self._date(bounds[i - 1], bounds[i], bounds[i + 1], each[i - 1], each[i]))
+        for i in range(1, len(plants)):
+            begins.append(self._date(bounds[i - 1], bounds[i], bounds[i + 1], plants[i - 1], plants[i]))
         ends = [begin[0] for begin in begins[1:]] + [self.window.samples]
-        for begin, end, (first, last), plant in zip(begins, ends, pairwise(bounds), each, strict=True):
+        for begin, end, (first, last), plant in zip(begins, ends, pairwise(bounds), plants, strict=True):
             if not plant.faults:
                 yield TimelineStretch(begin, None)
                 continue

@@ -181,14 +181,14 @@ def _measure_with_model(
     generic = model_order.generic_loop(rate, cutoff, 3.0 * noise * math.sqrt(sign_rate**3 / (4.0 * rate)))
     g = model_order.form_regressors(recording, generic)
     v = g.phi[:, 1 if loop is None else 1 - loop.plant.derivative]
-    at_rest, rest = signals.detect_rest(recording, v, noise * math.sqrt(own_rate**3 / (32.0 * rate)))
+    at_rest, rest_speed = signals.detect_rest(recording, v, noise * math.sqrt(own_rate**3 / (32.0 * rate)))
     moving = motion_mask(g, at_rest)
     block = settling_samples(cutoff, 4, 1.0 / rate)
     orders, best = model_order.select_order(g, g.ok & moving, block)
     m = m.model_copy(
         update={
-            "rest": rest,
-            "dead_zone": signals.dead_zone(recording.u, v, rest.speed),
+            "rest": rest_speed,
+            "dead_zone": signals.dead_zone(recording.u, v, rest_speed.speed),
             "band": band if m.coherent else None,
             "frequencies": _frequency_excitations(judged, loop, rate, None, m.coherent),
             "cutoff_hz": cutoff,
@@ -223,26 +223,28 @@ def _measure_with_model(
     return m, InspectionTraces(recording, spectra, fit.v, used, rho)
 
 
-def _check_delay(found: delay.Delay, recording: Recording, loop: Loop | None, g: Regressors) -> delay.Delay:
+def _check_delay(estimate: delay.Delay, recording: Recording, loop: Loop | None, g: Regressors) -> delay.Delay:
     """Put the likeliest delay in the place of one that the regression, whose regressors are noisy, dates late."""
-    if loop is None or found.samples is None or found.gain <= DELAY_GAIN:
-        return found
-    if found.samples < 0.0 or abs(found.samples - found.configured_samples) <= DELAY_TOLERANCE:
-        return found
+    if loop is None or estimate.samples is None or estimate.gain <= DELAY_GAIN:
+        return estimate
+    if estimate.samples < 0.0 or abs(estimate.samples - estimate.configured_samples) <= DELAY_TOLERANCE:
+        return estimate
     from servoscope.learning.inspection.delay_fit import fit_delay  # its kernels are loaded for a doubt, not before
 
     exact = fit_delay(loop, recording, g)
     if exact is None or not exact.white:
-        return found
+        return estimate
     rate = recording.sample_rate
     samples, half = exact.seconds * rate, 1.96 * exact.std_s * rate
     low, high = samples - half, samples + half
     if 2.0 * half > delay.MAX_INTERVAL_SAMPLES:
         words = message("inspection.delay_flat", low=low, high=high)
-        return delay.Delay(low_samples=low, high_samples=high, configured_samples=found.configured_samples, words=words)
+        return delay.Delay(
+            low_samples=low, high_samples=high, configured_samples=estimate.configured_samples, words=words
+        )
     words = message("inspection.delay_value", samples=samples, ms=1e3 * exact.seconds, low=low, high=high)
     values = {"samples": samples, "seconds": exact.seconds, "low_samples": low, "high_samples": high, "words": words}
-    return found.model_copy(update=values | {"gain": found.gain if exact.significant else 0.0})
+    return estimate.model_copy(update=values | {"gain": estimate.gain if exact.significant else 0.0})
 
 
 def _suggested_cutoff(spectra: Spectra | None, coherent: float | None, noise: float, rate: float) -> float:

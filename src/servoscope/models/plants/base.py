@@ -309,7 +309,7 @@ class Plant(BaseModel, abc.ABC):
         `factors`: what `scaled` takes, an array (count,) for each.
         """
         plants = (self.scaled({name: factor[i] for name, factor in factors.items()}) for i in range(count))
-        A, B, C = (np.stack(each) for each in zip(*(plant.state_space() for plant in plants), strict=True))
+        A, B, C = (np.stack(matrices) for matrices in zip(*(plant.state_space() for plant in plants), strict=True))
         return A, B, C
 
     def _check_ratios(self, ratios: Mapping[str, float]) -> None:

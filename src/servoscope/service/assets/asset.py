@@ -300,10 +300,10 @@ class Asset(StateHolder):
     def _is_first_diagnosis(self, window: PendingDiagnosis) -> bool:
         return window.until <= self._schedule.end(self.take_state().examination.since)
 
-    def apply_prognosis(self, found: Prognosis) -> StepResult:
+    def apply_prognosis(self, prognosis: Prognosis) -> StepResult:
         """Keep a prognosis, and advance the alarms by it."""
         state, self._result = self.take_state(), StepResult([], [])
-        self.state = replace(state, outlook=Outlook.from_prognosis(found, state.position.t))
+        self.state = replace(state, outlook=Outlook.from_prognosis(prognosis, state.position.t))
         self._advance_alarms(state.position.t)
         return self._result
 

@@ -51,13 +51,15 @@ class Outlook(BaseModel):
     summary: str
 
     @classmethod
-    def from_prognosis(cls, found: Prognosis, asked: float) -> Self:
+    def from_prognosis(cls, prognosis: Prognosis, asked: float) -> Self:
         """Return what is kept of a prognosis."""
-        reach = tuple(None if remaining is None else found.to_t + remaining for remaining in found.remaining_s or ())
+        reach = tuple(
+            None if remaining is None else prognosis.to_t + remaining for remaining in prognosis.remaining_s or ()
+        )
         return cls.model_validate(
             {
-                **{key: getattr(found, key) for key in ("name", "limit", "outlook", "rate_per_day", "summary")},
-                "t": found.to_t,
+                **{key: getattr(prognosis, key) for key in ("name", "limit", "outlook", "rate_per_day", "summary")},
+                "t": prognosis.to_t,
                 "asked": asked,
                 "reach_t": reach or None,
             }

@@ -65,11 +65,11 @@ class LearningStatus(_StatusRecord):
     learned_s: float
     needed_s: float
 
-    def sentence(self, found: str) -> str:
+    def sentence(self, cause: str) -> str:
         """Return how far it is, with what the earlier baseline finds."""
         key = "service.examination.confirmed" if self.confirmed else "service.examination.learning"
         minutes = {"learned": self.learned_s / 60.0, "needed": self.needed_s / 60.0}
-        return render(message(key, after=self.after, found=found, **minutes))
+        return render(message(key, after=self.after, found=cause, **minutes))
 
 
 class AssetMetadata(_StatusRecord):

@@ -64,7 +64,7 @@ class TextPattern:
         return {"/".join("+" if NAME.search(level) else level for level in text.split("/")) for text in patterns}
 
 
-def _match_level(parts: list[str], level: str, found: dict[str, str]) -> bool:
+def _match_level(parts: list[str], level: str, values: dict[str, str]) -> bool:
     """Add what the names of a level stand for; return whether it fits."""
     first, last = parts[0], parts[-1]
     start, end = len(first), len(level) - len(last)
@@ -75,9 +75,9 @@ def _match_level(parts: list[str], level: str, found: dict[str, str]) -> bool:
         if at < 0:
             return False
         value, end = level[at + len(parts[k - 1]) : end], at
-        if found.setdefault(parts[k], value) != value:
+        if values.setdefault(parts[k], value) != value:
             return False
-    return found.setdefault(parts[1], level[start:end]) == level[start:end]
+    return values.setdefault(parts[1], level[start:end]) == level[start:end]
 
 
 def split_path(path: str) -> tuple[str | int, ...]:
