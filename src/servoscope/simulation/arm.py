@@ -135,7 +135,7 @@ def _motion(rng: np.random.Generator, t: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def write_example(folder: str | Path) -> None:
-    """Write a loop file, its URDF, five healthy logs, and two in which the friction or the payload changes.
+    """Write a loop file, its URDF, five healthy logs, two in which friction or payload changes, and one of 5 kg.
 
     Raises OutputError if one of them cannot be written.
     """
@@ -154,6 +154,7 @@ def write_example(folder: str | Path) -> None:
     atomic_write(folder / "arm.toml", ("\n".join(lines) + "\n").encode())
     logs: dict[str, ArmChange | None] = {f"day{day + 1}": None for day in range(5)}
     logs |= {"tuesday": ArmChange("friction", 1.4, 3, 20.0), "pallet": ArmChange("payload", 2.0, 6, 20.0)}
+    logs["load"] = ArmChange("payload", 5.0)
     for seed, (name, change) in enumerate(logs.items()):
         log = simulate_arm(seed, EXAMPLE_S, change)
         rows = np.column_stack(list(log.values()))
