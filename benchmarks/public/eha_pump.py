@@ -39,7 +39,7 @@ def main() -> None:
         judged = [healthy, *(read[name] for name in LOADED), with_gain(healthy, GAIN)]
         scores = all_scores(with_error(loop, 0.0), [read[one]], judged, WINDOW_S)
         named = {plain: scores.pop(OURS), example: servoscope_scores(loop, [read[one]], judged), **scores}
-        for name, (limit, largest, _) in named.items():
+        for name, (limit, largest, *_) in named.items():
             loads.setdefault(name, Count()).add(Scores(limit, largest[:-1]), 1)
             gains.setdefault(name, Count()).add(Scores(limit, (largest[0], largest[-1])), 1)
     note = "Learned from one recording of load 1, then from the other. 31 s at 1 kHz each. Windows of 5 s."

@@ -75,7 +75,7 @@ FAULTS: dict[str, tuple[str, tuple[float, float], str, str]] = {
     ),
     "overlap": (
         "overlap",
-        (0.1, 10.0),
+        (0.1, 20.0),
         "more u before anything moves: overlap of the valve, hysteresis, static friction",
         "valve: worn edges, its zero, contamination; amplifier: dead band",
     ),
