@@ -47,13 +47,13 @@ class Experiment:
         `free`: those that are searched, all if None.
         """
         e = np.zeros(0)
-        if np.isfinite(x).all():  # LAPACK would say so on the terminal
-            try:
-                with np.errstate(over="ignore", invalid="ignore"):  # a step too far gives numbers that cost too much
+        with np.errstate(over="ignore", invalid="ignore"):  # a step too far gives numbers that cost too much
+            if np.isfinite(x).all():  # LAPACK would say so on the terminal
+                try:
                     e = self.residual(x)
-            except CANNOT_RUN:
-                e = np.zeros(0)
-        squares = float(e @ e) if len(e) else np.inf
+                except CANNOT_RUN:
+                    e = np.zeros(0)
+            squares = float(e @ e) if len(e) else np.inf
         free = np.arange(len(x)) if free is None else free
         if not np.isfinite(squares) or not (squares > 0.0 or self.level_known):
             return Fit(self, x, free, e, np.inf)
