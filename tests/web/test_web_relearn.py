@@ -34,7 +34,7 @@ def test_after_a_repair_an_asset_learns_again(chromium: Any, tmp_path: Path) -> 
         page.get_by_role("button", name="This was repaired").click()  # 2
         page.get_by_role("button", name="Learn again").click()  # 3
         part = page.locator("section", has=page.get_by_role("heading", name="Baseline", exact=True))
-        expect(part).to_contain_text(re.compile("Learn(ing|ed enough) after repair"))
+        expect(part).to_contain_text(re.compile("Learn(ing|ed enough) after repair"), timeout=LONG_MS)
         expect(part).to_contain_text("Learned enough after repair", timeout=LONG_MS)
         accessible(page)
         part.get_by_role("button", name="This was healthy").click()
@@ -42,16 +42,16 @@ def test_after_a_repair_an_asset_learns_again(chromium: Any, tmp_path: Path) -> 
         page.get_by_role("button", name="Preview").click()
         take = part.get_by_role("button", name="Put in force")
         take.wait_for(timeout=LONG_MS)
-        expect(part.get_by_role("region", name="What moved")).to_contain_text("inertia")
+        expect(part.get_by_role("region", name="What moved")).to_contain_text("inertia", timeout=LONG_MS)
         accessible(page)
         take.click()
-        expect(part).to_contain_text("Baseline 2 is in force.")
+        expect(part).to_contain_text("Baseline 2 is in force.", timeout=LONG_MS)
         assert [baseline_of(base, id_) for id_ in before] == list(before.values())  # and not the new one's
-        until(lambda: asked(base, "/assets/axis")["verdict"] == "healthy")
+        until(lambda: asked(base, "/assets/axis")["verdict"] == "healthy", 180.0)
         part.get_by_role("button", name="One step back").click()
         page.get_by_role("dialog").get_by_label("Why").fill("not run in")
         page.get_by_role("button", name="Go back").click()
-        expect(part).to_contain_text("Baseline 3 is in force.")
+        expect(part).to_contain_text("Baseline 3 is in force.", timeout=LONG_MS)
         notes = asked(base, "/assets/axis/notes")["notes"]
         assert [note["kind"] for note in notes] == ["repair", "baseline", "baseline"]
         assert all(note["who"] == "local" for note in notes)
