@@ -11,40 +11,20 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # where `accuracy` is a package
 
 import numpy as np
-from scipy.linalg import expm
-from scipy.signal import lfilter
 from tables import Table, parser, show
 
 import servoscope as ss
-from accuracy.noisy_output import GAIN, RATE, TRUE, XI, W, motion
+from accuracy.noisy_output import RATE, TRUE, drive
 from servoscope.core.arrays import FloatArray
 from servoscope.estimation.instrumental_fit import fit_with_instrument
 from servoscope.learning.inspection.delay_fit import COEFFICIENT_LOG_STD, DelaySearch
 from servoscope.learning.recursion import tune_pipeline
-from servoscope.signals import clean
 
 RUNS = 4  # recordings of three minutes per row
 LEVELS_DB = (20.0, 10.0)  # rms of y over that of its noise
 COLOUR_S = 0.1  # time constant of coloured noise
 SOURCES = {"input": "u is the command", "reference": "closed loop"}
 MOTIONS = {"random": "random motion", "moves": "moves of least jerk"}
-
-
-def recording(seed: int, source: str, level_db: float, kind: str, coloured: bool) -> ss.Recording:
-    """Return what `accuracy.noisy_output.drive` does, with noise that may be coloured."""
-    command, open_loop = motion(seed, kind), source == "input"
-    lines = [[0.0, 1.0, 0.0], [-W * W, -2.0 * XI * W, W * W]] if open_loop else [[0.0, 1.0, 0.0], [0.0, -4.0, 0.5]]
-    exact, x = expm(np.vstack([lines, np.zeros(3)]) / RATE), np.zeros(2)
-    n = 10.0 ** (-level_db / 20.0) * np.random.default_rng(10_000 + seed).normal(size=len(command))
-    if coloured:
-        a = float(np.exp(-1.0 / (COLOUR_S * RATE)))
-        n = lfilter([np.sqrt(1.0 - a * a)], [1.0, -a], n)
-    u, y = np.empty_like(n), np.empty_like(n)
-    for k, r in enumerate(command):
-        y[k] = x[0] + n[k]
-        u[k] = r if open_loop else GAIN * (r - y[k])
-        x = exact[:2, :2] @ x + exact[:2, 2] * u[k]
-    return clean(np.arange(len(n)) / RATE, u if open_loop else command, u, y, name=f"{seed}", sample_rate=RATE)
 
 
 def errors(recorded: ss.Recording, source: str) -> FloatArray:
@@ -76,7 +56,8 @@ def main() -> None:
             for level in LEVELS_DB:
                 for coloured in (False, True):
                     runs = [
-                        errors(recording(2_000_000 + i, source, level, kind, coloured), source) for i in range(RUNS)
+                        errors(drive(2_000_000 + i, source, level, kind, COLOUR_S * coloured), source)
+                        for i in range(RUNS)
                     ]
                     rms = 100.0 * np.sqrt(np.mean(np.square(runs), axis=0))  # of all coefficients, the worst one
                     cells = ["refused" if np.isnan(each).any() else f"{each.max():.2g} %" for each in rms]

@@ -90,12 +90,18 @@ def motion(seed: int, kind: str) -> FloatArray:
     return np.asarray(slow[2000:] / slow[2000:].std())
 
 
-def drive(seed: int, source: str, level_db: float, kind: str = "random") -> ss.Recording:
-    """Return a pitch drive whose command is u, or an axis behind a P controller that answers the noise of y."""
+def drive(seed: int, source: str, level_db: float, kind: str = "random", colour_s: float = 0.0) -> ss.Recording:
+    """Return a pitch drive whose command is u, or an axis behind a P controller that answers the noise of y.
+
+    `colour_s`: time constant of the noise [s]; 0: white.
+    """
     command, open_loop = motion(seed, kind), source == "input"
     lines = [[0.0, 1.0, 0.0], [-W * W, -2.0 * XI * W, W * W]] if open_loop else [[0.0, 1.0, 0.0], [0.0, -4.0, 0.5]]
     exact, x = expm(np.vstack([lines, np.zeros(3)]) / RATE), np.zeros(2)
     n = 10.0 ** (-level_db / 20.0) * np.random.default_rng(10_000 + seed).normal(size=len(command))
+    if colour_s:
+        a = float(np.exp(-1.0 / (colour_s * RATE)))
+        n = lfilter([np.sqrt(1.0 - a * a)], [1.0, -a], n)
     u, y = np.empty_like(n), np.empty_like(n)
     for k, r in enumerate(command):
         y[k] = x[0] + n[k]
