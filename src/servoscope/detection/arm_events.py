@@ -66,18 +66,6 @@ def outside_torque(
     return np.asarray(np.sign(mean) * np.maximum(np.abs(mean) - allowed, 0.0))
 
 
-def largest_events(
-    signals: ArmSignals,
-    design: FloatArray,
-    residual: FloatArray,
-    noise: FloatArray,
-    model: ArmModel,
-    theta: FloatArray,
-) -> FloatArray:
-    """Return the largest torque from outside of each joint, in units of the noise, (n,)."""
-    return np.asarray(np.abs(outside_torque(signals, design, residual, noise, model, theta)).max(1) / noise)
-
-
 def find_events(t: FloatArray, outside: FloatArray, limits: FloatArray, names: tuple[str, ...]) -> list[ArmEvent]:
     """Return the events of a recording; none where what exceeds the limits lasts, so that it is a change.
 

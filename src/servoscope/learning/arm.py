@@ -23,7 +23,7 @@ from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import NotEnoughError, RecordingError
 from servoscope.core.messages import Message, message
-from servoscope.detection.arm_events import EVENT_MARGIN, MIN_EVENT_LIMIT, MIN_EVENT_SHARE, largest_events
+from servoscope.detection.arm_events import EVENT_MARGIN, MIN_EVENT_LIMIT, MIN_EVENT_SHARE, outside_torque
 from servoscope.detection.arm_evidence import (
     BETWEEN_SHARE,
     DRIFT_SHARE,
@@ -108,7 +108,7 @@ def learn_arm(loop: ArmLoop, urdf: str, recordings: Sequence[ArmRecording]) -> A
     limits, odd = _judge_each(model, recordings, fit, scatter)
     events = np.max(
         [
-            largest_events(signal, X, e, fit.noise, model, theta)
+            np.abs(outside_torque(signal, X, e, fit.noise, model, theta)).max(1) / fit.noise
             for signal, X, e in zip(signals, designs, residuals, strict=True)
         ],
         axis=0,
