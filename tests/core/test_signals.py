@@ -42,11 +42,20 @@ def test_a_signal_at_any_moment_ends_quietly(hall: Path, command: tuple[str, ...
         until(lambda process=process: is_loading(process), 60.0)
         time.sleep(delay)
         process.send_signal(number)
-        code = process.wait(60)
+        code = ended(process, log)
         assert "Traceback" not in log.read_text(), (delay, log.read_text())
         # shells call an end by a signal 128 and its number
         documented = {0, 130, -signal.SIGINT} if number == signal.SIGINT else {0, -signal.SIGTERM}
         assert code in documented, (delay, code, log.read_text())
+
+
+def ended(process: subprocess.Popen[bytes], log: Path) -> int:
+    try:
+        return process.wait(60)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+        pytest.fail(f"a signal was lost: {log.read_text()}")
 
 
 def is_loading(process: subprocess.Popen[bytes]) -> bool:

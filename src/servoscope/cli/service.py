@@ -17,7 +17,7 @@ import typer
 
 from servoscope.cli.app import app
 from servoscope.cli.arguments import parse_time
-from servoscope.cli.exit import print_json
+from servoscope.cli.exit import EXIT_INTERRUPTED, print_json
 from servoscope.cli.options import JsonOption
 from servoscope.cli.output_paths import check_output
 from servoscope.core.errors import ConfigError, ObsoleteSettingWarning, StoreError
@@ -71,6 +71,7 @@ def run(
     """
     # nothing has begun yet that would have to be ended; an exception may be lost in the middle of an import
     signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
+    signal.signal(signal.SIGINT, lambda *_: os._exit(EXIT_INTERRUPTED))
     from servoscope.service import log
     from servoscope.service.build import build_components, check_service_file
     from servoscope.service.config import ServiceFile
