@@ -16,7 +16,7 @@ from typing import Any
 from starlette.exceptions import HTTPException
 
 from servoscope.core.errors import ServoscopeError
-from servoscope.core.messages import SETTING, current_language, message, render
+from servoscope.core.messages import SETTING, current_language, say
 from servoscope.core.sandbox import Sandbox
 from servoscope.core.workers import ProcessLimits, Progress, Workers
 from servoscope.web import errors
@@ -124,9 +124,9 @@ class JobQueue:
         except HTTPException as error:
             shown.problem = errors.problem(error.status_code, str(error.detail))
         except asyncio.CancelledError:
-            shown.problem = errors.problem(409, render(message("web.job_stopped")))
+            shown.problem = errors.problem(409, say("web.job_stopped"))
         except Exception:
-            shown.problem = errors.problem(500, render(message("web.job_failed")))
+            shown.problem = errors.problem(500, say("web.job_failed"))
             raise
         finally:
             if shown.problem is not None:
