@@ -12,6 +12,7 @@ from servoscope.cli import arguments
 from servoscope.cli.app import app
 from servoscope.cli.exit import EXIT_FAULT, print_json
 from servoscope.cli.options import ColumnsOption, JsonOption, with_options
+from servoscope.cli.progress import show_count, show_spinner
 
 if TYPE_CHECKING:
     from pyspark.sql import SparkSession
@@ -93,7 +94,6 @@ def fleet(
     if len(keys) != 2 or not all(keys):
         raise typer.BadParameter(f"--partition {partition!r}: write two names, as in asset,day")
 
-    from servoscope.cli.progress import show_count
     from servoscope.fleet import Lake, Plan, run
     from servoscope.fleet.lake import read_groups
     from servoscope.fleet.sinks import write_stream_report
@@ -154,7 +154,6 @@ def _follow(
     master: str | None,
 ) -> SparkSession:
     """Follow what comes in: all there is, or on and on until interrupted; return the session."""
-    from servoscope.cli.progress import show_spinner
     from servoscope.fleet import sinks
     from servoscope.fleet.baselines import Baselines
     from servoscope.fleet.spark import session

@@ -21,7 +21,7 @@ from servoscope.cli.exit import EXIT_INTERRUPTED, print_json
 from servoscope.cli.options import JsonOption
 from servoscope.cli.output_paths import check_output
 from servoscope.core.errors import ConfigError, ObsoleteSettingWarning, StoreError
-from servoscope.core.messages import count_words, message, render
+from servoscope.core.messages import count_words, say
 from servoscope.core.settings_errors import suggest_name
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ def run(
             lines = check_service_file(settings)
         counts = {"asset": len(settings.assets), "source": len(settings.sources)}
         counted = ", ".join(count_words(count, noun) for noun, count in counts.items())
-        typer.echo(render(message("cli.usable_file", path=str(config), counted=counted)))
+        typer.echo(say("cli.usable_file", path=str(config), counted=counted))
         for line in lines:
             typer.echo(line)
         if online:

@@ -21,6 +21,7 @@ from servoscope.cli.output_paths import RECORDINGS, REPORTS, check_output
 from servoscope.cli.progress import show_steps
 from servoscope.core.errors import LoopError
 from servoscope.core.files import atomic_write, exclusive_folder
+from servoscope.core.messages import say
 
 if TYPE_CHECKING:
     from servoscope.design import BaselineStudy
@@ -191,7 +192,6 @@ def tutorial(
 ) -> None:
     """Write the four logs that the tutorial reads: a motor axis, healthy on three days and faulty on Friday."""
     from servoscope.cli.render import results
-    from servoscope.report.page import say
     from servoscope.simulation.tutorial import DAYS, tutorial_log
 
     out = results.create_console()

@@ -8,10 +8,9 @@ from rich.console import Console
 from rich.text import Text
 
 from servoscope.cli.render.results import COLOURS, print_facts, print_notes, print_table
-from servoscope.core.messages import count_words, translate, translate_range
+from servoscope.core.messages import count_words, say, translate, translate_range
 from servoscope.core.number_format import format_ratios
 from servoscope.report.format_values import DASH, format_probability
-from servoscope.report.page import say
 
 if TYPE_CHECKING:
     from servoscope.fleet import Fleet
