@@ -7,9 +7,7 @@ from matplotlib.lines import Line2D
 
 from servoscope.diagnosis.motion_signature import MotionSignature
 from servoscope.report.format_values import axis_scale
-from servoscope.report.plotting import COLOURS, plot_style
-
-WIDTH = 9.0  # inches; the page scales pictures to its own width
+from servoscope.report.plotting import COLOURS, create_panels, plot_style
 
 
 @plot_style()
@@ -17,8 +15,7 @@ def plot_signature(
     before: MotionSignature | None, after: MotionSignature, *, units: tuple[str, str] = ("", "")
 ) -> Figure:
     """Draw mean u over position, forward and backward, and over speed; `units`: of the output and of the input."""
-    figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
-    of_position, of_speed = figure.subplots(1, 2, sharey=True)
+    figure, (of_position, of_speed) = create_panels(3.2, 1, 2, sharey=True)
     shown = [(before, COLOURS["healthy"], "before"), (after, COLOURS["measured"], "after" if before else "measured")]
     kept = [(signature, colour, words) for signature, colour, words in shown if signature is not None]
     y_unit, y_scale = axis_scale([signature.position for signature, *_ in kept], units[0])
