@@ -126,10 +126,9 @@ def fleet(
     if as_json:
         print_json(result.to_dict(), lines=False)
     else:
-        from servoscope.cli.render import fleet as fleets
-        from servoscope.cli.render import results
+        from servoscope.cli.render import fleet, results
 
-        fleets.print_fleet(results.create_console(), result)
+        fleet.print_fleet(results.create_console(), result)
         results.print_written_path(results.create_console(), output / "report.html")
     if fail_on_fault and (result.count("fault") or result.accepted):
         raise typer.Exit(EXIT_FAULT)

@@ -142,14 +142,13 @@ def watch(
     as_json: JsonOption = False,
 ) -> None:
     """Show assets as they are now: verdict, since when, residuals, alarms; read from the store."""
-    from servoscope.cli.render import history as tables
-    from servoscope.cli.render import results
+    from servoscope.cli.render import history, results
 
     opened, out = open_store(store, asset or ()), results.create_console()
 
     def page() -> Group:
         try:
-            return tables.status_page(opened.statuses(asset), out.width)
+            return history.status_page(opened.statuses(asset), out.width)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise StoreError(f"{store}: holds a damaged status ({error!r}), restore a backup of the store") from None
 
@@ -189,8 +188,7 @@ def history(
     check_output(output, "-o", EXPORTS, [])
     span = parse_time(since, "--from"), parse_time(until, "--to")
 
-    from servoscope.cli.render import history as tables
-    from servoscope.cli.render import results
+    from servoscope.cli.render import history, results
     from servoscope.service.store.queries import query_history, with_time_text
 
     shown = last if last is not None or as_json or output is not None else DEFAULT_ROWS
@@ -203,17 +201,16 @@ def history(
         for row in rows:
             print_json(with_time_text(row), lines=True)
     else:
-        results.create_console().print(tables.row_table(rows, COLUMNS[kind]))
+        results.create_console().print(history.row_table(rows, COLUMNS[kind]))
 
 
 def commission(settings: ServiceFile, seconds: float) -> None:
     """Print how each asset is heard; exit with 1 if one is not as its loop needs it."""
-    from servoscope.cli.render import history as tables
-    from servoscope.cli.render import results
+    from servoscope.cli.render import history, results
     from servoscope.service.commissioning import listen
 
     rows = listen(settings, seconds)
-    results.create_console().print(tables.commissioning_table(rows))
+    results.create_console().print(history.commissioning_table(rows))
     if any(row.reception.state != "followed" for row in rows):
         raise typer.Exit(1)
 

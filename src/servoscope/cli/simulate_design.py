@@ -104,8 +104,7 @@ def design(
     arguments.check_reference(reference)
 
     from servoscope.baseline.baseline import Baseline
-    from servoscope.cli.render import design as studies
-    from servoscope.cli.render import results
+    from servoscope.cli.render import design, results
     from servoscope.design import DesignStudy, design_study, study_baseline
     from servoscope.models.loop import Loop
     from servoscope.report import plain_values
@@ -134,9 +133,9 @@ def design(
     if as_json:
         print_json(plain_values.to_plain_values(study), lines=False)
     elif isinstance(study, DesignStudy):
-        studies.print_study(results.create_console(), study)
+        design.print_study(results.create_console(), study)
     else:
-        studies.print_learned_study(results.create_console(), study)
+        design.print_learned_study(results.create_console(), study)
     if report is not None:
         if not isinstance(study, DesignStudy):
             raise LoopError(f"{loop}: no page without a simulation of the loop: {study.missing}")

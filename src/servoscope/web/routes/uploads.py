@@ -125,11 +125,8 @@ async def start_proposal(context: ContextDep, who: Operator, request: ProposalRe
 async def get_job(context: ContextDep, id: str, query: Annotated[JobQuery, Query()]) -> JobResponse:
     """Return how far a job is; with `wait`, as soon as it has ended."""
     job = context.jobs.find(id)
-    if query.wait and job.response.finished is None:
-        try:
-            await asyncio.wait_for(job.ended.wait(), query.wait)
-        except TimeoutError:
-            return job.response
+    if query.wait:
+        await asyncio.wait([job.handle], timeout=query.wait)
     return job.response
 
 
@@ -139,4 +136,4 @@ async def cancel_job(context: ContextDep, who: Operator, id: str) -> None:
     job = context.jobs.find(id)
     if job.user != who.user and who.role != "engineer":
         raise HTTPException(403, f"it is {job.user}'s")
-    context.jobs.cancel(job)
+    job.handle.cancel()
