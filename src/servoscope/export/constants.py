@@ -21,7 +21,7 @@ from servoscope.estimation.recursion import Recursion
 from servoscope.export.image import fingerprint
 from servoscope.export.texts import plain_text
 
-__all__ = ["ExportConstants", "check_name", "common_words", "refuse_covariates"]
+__all__ = ["ExportConstants", "check_name", "common_words", "covariate_tables", "refuse_covariates"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +145,26 @@ def common_words(made: ExportConstants, name: str) -> dict[str, Any]:
         "mark": [f"0x{byte:02X}u" for byte in made.mark],
         "sample": SAMPLE,
         "armed": ARMED,
+    }
+
+
+def covariate_tables(made: ExportConstants) -> dict[str, FloatArray]:
+    """Return the constants that a monitor with covariates has beside those of its recursion, by name."""
+    if made.covariates is None:
+        return {}
+    model, c = made.covariates.model, made.recursion.constants[0]
+    half = 0.5 * (np.array(model.high) - np.array(model.low))
+    E = made.baseline.pipeline().bank.E(made.baseline.loop.monitor.frequencies)
+    return {
+        "known_range": np.column_stack(model.known),
+        "learned": np.column_stack([model.origin, half]),
+        "slopes": np.array(model.slopes),
+        "slope_covariance": np.array(model.covariance),
+        "to_state": np.linalg.inv(c.basis),
+        "to_response": np.stack([E.real, E.imag], axis=1).reshape(-1, len(made.expected)),
+        "theta_middle": np.array(made.baseline.theta),
+        "theta_expected": made.expected,
+        "theta_origin": c.origin,
     }
 
 

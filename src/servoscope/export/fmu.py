@@ -16,7 +16,7 @@ from servoscope import __version__
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import OutputError
 from servoscope.core.files import atomic_write
-from servoscope.export.c_monitor import NAME, export_c
+from servoscope.export.c_monitor import NAME, RESPONSE, export_c
 from servoscope.export.constants import refuse_covariates
 from servoscope.export.texts import fill_template
 
@@ -27,7 +27,6 @@ LIBRARY = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": (
 PROCESSORS = {"amd64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}
 EPOCH = (1980, 1, 1, 0, 0, 0)  # of all files in the archive: the same baseline gives the same bytes
 FIRST_NUMBER = 10  # value reference of the first number of an evaluation; fmi3.c calls it NUMBERS
-RESPONSE = ("real", "imag", "variance_real", "covariance", "covariance_again", "variance_imag")
 
 
 def export_fmu(baseline: Baseline, path: str | Path, name: str = NAME, *, only_coefficients: bool = False) -> bool:
