@@ -1,4 +1,4 @@
-"""The commands of the service: run it, watch it, print its history, replay recordings to it."""
+"""The commands of the service: run it, watch it, print its history, back up its store, replay recordings to it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -286,3 +286,38 @@ def publish(
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: publisher.stop())
     publisher.run()
+
+
+store_app = typer.Typer(no_args_is_help=True, help="Back up a history, and restore it.")
+app.add_typer(store_app, name="store")
+
+
+@store_app.command()
+def backup(
+    store: StoreArgument,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write; it must not exist yet.")],
+) -> None:
+    """Write all that a store holds at this moment into a file, which is a store itself; services may go on."""
+    from servoscope.service.store.copy import copy_store
+
+    with closing(open_store(store)) as opened:
+        _print_counts(file, copy_store(opened, str(file.absolute())))
+
+
+@store_app.command()
+def restore(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="What backup has written.")], store: StoreArgument
+) -> None:
+    """Bring a backup into a store that has no history yet: a new SQLite file, or an empty PostgreSQL database."""
+    from servoscope.service.store.copy import copy_store
+    from servoscope.service.store.engine import display_url, parse_store_url
+
+    url, folder = parse_store_address(store)
+    with closing(open_store(str(file))) as opened:
+        counts = copy_store(opened, url, folder)
+    _print_counts(display_url(parse_store_url(url, folder or Path())), counts)
+
+
+def _print_counts(where: str | Path, counts: dict[str, int]) -> None:
+    rows, states = sum(counts.values()), counts.get("checkpoints", 0)
+    typer.echo(f"{where}: {count_words(rows, 'row', 'en')}, {count_words(states, 'saved_state', 'en')}")

@@ -135,7 +135,6 @@ def _figures(
 ) -> Iterator[tuple[str, Figure]]:
     """Yield the pictures of the document by name."""
     from servoscope.report import diagnosis_figures as figures
-    from servoscope.report.signature_figure import plot_signature
 
     yield "statistic", figures.plot_statistic(trace, diagnosis)
     yield "signals", figures.plot_signals(recording, diagnosis, units=loop.plant.units)
@@ -146,7 +145,7 @@ def _figures(
         yield "sizes", sizes
     before, after = signatures
     if after is not None:
-        yield "signature", plot_signature(before, after, units=loop.plant.units)
+        yield "signature", figures.plot_signature(before, after, units=loop.plant.units)
 
 
 def _widths(
