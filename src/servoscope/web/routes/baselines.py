@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import shutil
-import tomllib
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from importlib.resources import files
@@ -170,7 +169,7 @@ def list_loops(context: ContextDep) -> responses.LoopList:
     rows = []
     for name in EXAMPLES:
         text = files("servoscope.simulation").joinpath(f"{name}.toml").read_text(encoding="utf-8")
-        rows.append(_loop_row({"example": name}, Loop.from_dict(tomllib.loads(text)), text))
+        rows.append(_loop_row({"example": name}, Loop.from_text(text, f"{name}.toml"), text))
     loops = ((file.row.id, load_cached(file.path).loop) for file in _list_files(context))
     rows += [_loop_row({"baseline": id_}, loop, None) for id_, loop in loops if isinstance(loop, Loop)]
     return responses.LoopList(loops=rows)
