@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 from accuracy import nonlinear, run
-from recordings import RIG
+from studies.design import size
+from studies.recordings import RIG
 
 import servoscope as ss
-from design import size
 from servoscope.design.detectability import AlarmPower, detectable_size
 from servoscope.design.mimics import match_mimic, mimic_causes
 from servoscope.design.scenario import Scenario
