@@ -13,7 +13,7 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,11 +27,9 @@ from servoscope.core.jit.symbolic import Int
 from servoscope.estimation import estimators
 from servoscope.estimation.kernel import sparse_lti
 from servoscope.estimation.update import read_matrix, write_matrix
+from servoscope.models.loop import Loop
 from servoscope.models.lti import LinearSystem, tapped_delay_line
 from servoscope.signals import Recording
-
-if TYPE_CHECKING:
-    from servoscope.models.loop import Loop
 
 LENGTHS = {"fir": 40, "laguerre": 12}  # functions, where a loop file does not say
 RIDGE = 1e-4  # of the mean excitation: what r excites less is not learned, and adds no noise to u_a

@@ -8,7 +8,7 @@ before the chunk in front of its own.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,11 +18,8 @@ from servoscope.core.jit import maximum, minimum, where
 from servoscope.core.jit.array_function import ArrayFunction
 from servoscope.core.jit.arrays import Variable
 from servoscope.models.discretise import transition
+from servoscope.models.loop import Loop
 from servoscope.models.plants import Column, Plant
-
-if TYPE_CHECKING:
-    from servoscope.models.loop import Loop
-
 
 INTEGRAL, LAST_PLANT, HEADER_SIZE = 0, 1, 2  # places in the row; the plant's state follows the head
 
