@@ -11,6 +11,7 @@ from __future__ import annotations
 from servoscope.core.jit.symbolic import (
     Bool,
     Float,
+    Int,
     dot,
     fma,
     maximum,
@@ -25,6 +26,7 @@ from servoscope.core.jit.symbolic import (
 __all__ = [
     "Bool",
     "Float",
+    "Int",
     "dot",
     "fma",
     "maximum",
