@@ -1,9 +1,8 @@
-"""The door to machine code: arithmetic written once for every language, and loops that Numba compiles.
+"""The door to machine code: arithmetic written once for every language, and loops over arrays.
 
 *Traced* functions are straight-line arithmetic (`core.jit.symbolic`), run once with symbols. They become vector
 instructions (`core.jit.llvm_text`, `core.jit.native`), C (`core.jit.c_source`) or Structured Text
 (`core.jit.st_source`). Loops over arrays are traced in the same way (`core.jit.array_function`, `core.jit.arrays`).
-A *kernel* is a plain loop that Numba compiles on its first call (`core.jit.loops`): windows of features.
 """
 
 from __future__ import annotations
