@@ -136,7 +136,7 @@ class Pipeline:
         """
         if self.bank.structure != "svf":
             return 1
-        return max(1, int(self.loop.sample_rate / (10.0 * filter_bank.filter_cutoff(self.loop))))
+        return max(1, int(self.loop.sample_rate / (10.0 * self.loop.cutoff)))
 
     @property
     def memory(self) -> float:
@@ -249,7 +249,7 @@ class Pipeline:
     def kinematics(self) -> Pipeline:
         """What forms position, speed and acceleration of a signal behind a filter with the loop's cutoff."""
         loop = self.loop
-        plain = {"structure": "svf", "cutoff": filter_bank.filter_cutoff(loop), "estimator": "akf", "two_stage": "none"}
+        plain = {"structure": "svf", "cutoff": loop.cutoff, "estimator": "akf", "two_stage": "none"}
         update = {
             "plant": PolynomialPlant(order=2, stiffness=True),
             "monitor": loop.monitor.model_copy(update=plain),

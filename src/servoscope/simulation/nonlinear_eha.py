@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +28,7 @@ from servoscope.simulation.measurement import (
     draw_noise,
     make_recording,
 )
-from servoscope.simulation.nonlinear_eha_kernels import RigConstants, run_rig
+from servoscope.simulation.nonlinear_eha_kernels import run_rig
 from servoscope.simulation.stability import check_stable
 
 REFERENCE_C = 40.0  # degC at which the plant's parameters hold
@@ -244,7 +245,8 @@ def _prepend_valve(system: StateSpace, rig: Rig) -> StateSpace:
     return whole, drive, np.hstack([C, np.zeros((1, 2))])
 
 
-def _rig_constants(plant: EHA, rig: Rig, loop: Loop, rows: FloatArray) -> RigConstants:
+def _rig_constants(plant: EHA, rig: Rig, loop: Loop, rows: FloatArray) -> dict[str, Any]:
+    """Return what does not change during a recording, in plain numbers and SI units."""
     w = 0.0 if rig.valve_hz is None else 2.0 * np.pi * rig.valve_hz
     _, _, leakage, friction, stiffness = rows.T
     # rates of the modes that the sub-steps must follow: oil spring, leakage, friction (steepest at rest), valve
@@ -254,20 +256,20 @@ def _rig_constants(plant: EHA, rig: Rig, loop: Loop, rows: FloatArray) -> RigCon
     substeps = rig.substeps or max(4, int(np.ceil(fastest / (MAX_RATE_STEP * loop.sample_rate))))
     stroke = np.inf if rig.stroke is None else rig.stroke
     span = 0.2 if rig.stroke is None else rig.stroke
-    return RigConstants(
-        mobility=1.0 / plant.m_p,
-        stiffness=plant.k_p,
-        area=plant.A_p,
-        square_root=rig.load_pressure_flow,
-        area_ratio=plant.area_ratio,
-        coulomb=rig.coulomb,
-        breakaway=rig.static - rig.coulomb,
-        stribeck_speed=rig.stribeck_speed,
-        smooth_speed=rig.smooth_speed,
-        half_stroke=0.5 * stroke,
-        valve=w,
-        damping=rig.valve_damping,
-        resolution=0.0 if rig.sensor_bits is None else span / 2.0**rig.sensor_bits,
-        T=1.0 / loop.sample_rate,
-        substeps=substeps,
-    )
+    return {
+        "mobility": 1.0 / plant.m_p,  # there are no divisions in the innermost loop
+        "stiffness": plant.k_p,
+        "area": plant.A_p,
+        "square_root": rig.load_pressure_flow,
+        "area_ratio": plant.area_ratio,
+        "coulomb": rig.coulomb,
+        "breakaway": rig.static - rig.coulomb,  # static friction beyond Coulomb friction
+        "stribeck_speed": rig.stribeck_speed,
+        "smooth_speed": rig.smooth_speed,
+        "half_stroke": 0.5 * stroke,
+        "valve": w,  # 0: the spool follows at once
+        "damping": rig.valve_damping,
+        "resolution": 0.0 if rig.sensor_bits is None else span / 2.0**rig.sensor_bits,  # 0: continuous
+        "T": 1.0 / loop.sample_rate,
+        "substeps": substeps,
+    }
