@@ -94,14 +94,12 @@ class StageOneRunner:
         P_d, n = np.array(tuning.P_d, dtype=np.float64), len(tuning.theta)
         padded = np.pad(P_d, (0, _vector_count(n) * VECTOR_WIDTH - n))  # with zeros, to whole vectors
         name, memory = loop.monitor.estimator, loop.monitor.memory * loop.sample_rate
-        self._compiled = {
-            "estimator": estimators.load_estimator(name),
-            "pattern": sparse_lti.sparsity_pattern([system]),
-        }
-        functions = sparse_lti.pack_coefficients(self._compiled["pattern"], system)
+        estimator, pattern = estimators.load_estimator(name), sparse_lti.sparsity_pattern([system])
+        self._compiled: dict[str, Any] = {"estimator": estimator, "pattern": pattern}
+        functions = sparse_lti.pack_coefficients(pattern, system)
         self._constants = functions, np.ascontiguousarray(system.steady[:, 0]), padded.ravel()
         self._numbers = tuning.R, memory, float(basis_settling_samples(system)), *map(float, limits)
-        own_P = np.zeros(0) if hasattr(self._compiled["estimator"], "steady_gain") else P_d.ravel()
+        own_P = np.zeros(0) if hasattr(estimator, "steady_gain") else P_d.ravel()
         private = np.zeros(estimators.extra_state_size(name, n, memory))
         parts = np.zeros(HEADER_SIZE), np.zeros(len(system.A)), np.array(tuning.theta), own_P, private
         self._start, self._cuts = np.concatenate(parts), np.cumsum([len(part) for part in parts])[:-1]

@@ -44,7 +44,7 @@ def read_matrix(rows: Any, n: int, begin: int = 0, apart: int = 0) -> Matrix:
     return [[rows[begin + (apart or n) * i + j] for j in range(n)] for i in range(n)]
 
 
-def write_matrix(rows: Any, matrix: Matrix, begin: int = 0) -> None:
+def write_matrix(rows: Any, matrix: Matrix, begin: Any = 0) -> None:
     """Write a matrix row by row from some place on."""
     for i, number in enumerate(number for row in matrix for number in row):
         rows[begin + i] = number
