@@ -24,10 +24,11 @@ from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from servoscope.baseline.covariates import EDGE_SHARE
 from servoscope.baseline.feature_spans import NO_COVARIATES, SpanFeatures
+from servoscope.baseline.records import BaselineModel, Matrix, Vector
 from servoscope.baseline.threshold import FEATURE_SHARE, SECONDS_PER_YEAR
 from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.estimation.window_features import MOTIONS, SIGNALS, FeatureLayout, Window
@@ -37,15 +38,8 @@ SCORE_POWER = 4.0  # in which the scores of groups are averaged
 WIDENING_SHARE = 0.5  # share by which the healthy range of motion is widened either way
 MIN_WIDENING = 0.05  # and by how much at least: of a share of time, of a logarithm of speed
 
-Vector = tuple[float, ...]
-Matrix = tuple[Vector, ...]
 
-
-class _FeatureRecord(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class FeatureGroup(_FeatureRecord):
+class FeatureGroup(BaselineModel):
     """Features that belong together, at one length of windows, of n healthy recordings."""
 
     level: int
@@ -65,7 +59,7 @@ class FeatureGroup(_FeatureRecord):
         return values[self.level, list(self.kept)], float(counts[self.level])
 
 
-class FeatureModel(_FeatureRecord):
+class FeatureModel(BaselineModel):
     """The features of healthy recordings; everything that compares another recording with them."""
 
     layout: FeatureLayout
