@@ -244,10 +244,7 @@ def _gap_defects(t: FloatArray, after: IndexArray, dropped: FloatArray, period: 
 
 
 def _saturation_defects(t: FloatArray, u: FloatArray, limits: tuple[float, float] | None) -> list[Defect]:
-    low, high = limits or (
-        min(float(u[rows].min()) for rows in outofcore.iter_chunks(0, u.size, u)),
-        max(float(u[rows].max()) for rows in outofcore.iter_chunks(0, u.size, u)),
-    )
+    low, high = limits or outofcore.extremes(u)
     slack = 0.0 if limits is None else 1e-6 * (high - low)
     defects = []
     for sign, value in ((1.0, high), (-1.0, low)):

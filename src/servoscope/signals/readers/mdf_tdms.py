@@ -46,10 +46,7 @@ MAX_RATIO = 1100  # rows per byte: of a byte each, deflated as far as deflate go
 
 def open_mdf(path: Path) -> TableFile:
     """Open an MDF file, version 3 or 4."""
-    try:
-        from asammdf import MDF
-    except ModuleNotFoundError:
-        raise RecordingError(f"{path}: MDF files need asammdf, pip install 'servoscope[mdf]'") from None
+    from asammdf import MDF
 
     logging.getLogger("asammdf").setLevel(logging.CRITICAL)  # broken files raise an error
     _ignore_external_attachments()
@@ -92,11 +89,8 @@ def open_mdf(path: Path) -> TableFile:
 
 def open_tdms(path: Path) -> TableFile:
     """Open a TDMS file."""
-    try:
-        from nptdms import TdmsFile
-        from nptdms.log import log_manager
-    except ModuleNotFoundError:
-        raise RecordingError(f"{path}: TDMS files need npTDMS, pip install 'servoscope[tdms]'") from None
+    from nptdms import TdmsFile
+    from nptdms.log import log_manager
 
     log_manager.set_level(logging.CRITICAL)  # broken files raise an error; no dump of their bytes on the terminal
 
@@ -175,7 +169,7 @@ def _open_measurement(
     def read_chunks(wanted: Sequence[str], _: Collection[str]) -> Iterator[Table]:
         import pyarrow as pa
 
-        raster = _common_raster(path, rasters, wanted)
+        raster = next(raster for raster in rasters if {*wanted} <= {*raster.places})
         try:
             with opened() as file:
                 for first in range(0, raster.rows, CHUNK_ROWS):
@@ -202,19 +196,6 @@ def _open_measurement(
         raise RecordingError(f"{path}: holds no channels with values")
     groups = tuple(tuple(raster.places) for raster in rasters)
     return TableFile(path, tuple(names), read_chunks, channel_groups=groups, aliases=aliases)
-
-
-def _common_raster(path: Path, rasters: Sequence[_Raster], wanted: Sequence[str]) -> _Raster:
-    """Return the raster that has all channels that are wanted."""
-    for raster in rasters:
-        if set(wanted) <= set(raster.places):
-            return raster
-    best = max(rasters, key=lambda raster: len(set(wanted) & set(raster.places)))
-    strange = next(name for name in wanted if name not in best.places)
-    raise RecordingError(
-        f"{path}: {strange!r} was not sampled together with {', '.join(n for n in wanted if n in best.places)}: "
-        "export all of them in one raster"
-    )
 
 
 def _arrow_values(cells: Any) -> Any:

@@ -112,10 +112,8 @@ def open_sqlite(path: Path) -> TableFile:
     check_width(path, len(places))
 
     def read_chunks(wanted: Sequence[str], _: Collection[str]) -> Iterator[Table]:
-        used = {places[name][0] for name in wanted}
-        if len(used) != 1:
-            raise RecordingError(f"{path}: {', '.join(sorted(used))} are different tables, take columns of one")
-        query = f"SELECT {', '.join(_quote(places[name][1]) for name in wanted)} FROM {_quote(used.pop())}"
+        table = places[wanted[0]][0]  # that of all of them
+        query = f"SELECT {', '.join(_quote(places[name][1]) for name in wanted)} FROM {_quote(table)}"
         try:
             with closing(_connect(path)) as database:
                 rows, first = database.execute(query), 1

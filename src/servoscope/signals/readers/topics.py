@@ -138,11 +138,6 @@ def _open_topics(path: Path, topics: Topics) -> TableFile:
     def read_chunks(wanted: Sequence[str], _: Collection[str]) -> Iterator[Table]:
         import pyarrow as pa
 
-        used = {columns[label][0] for label in wanted}
-        if len(used) > 1:
-            raise RecordingError(
-                f"{path}: {', '.join(sorted(used))} were not sampled together: log them in one topic, or resample them"
-            )
         values = {label: full[columns[label][0]][columns[label][1]] for label in wanted}
         yield Table(path.name, {label: pa.chunked_array([np.ascontiguousarray(x)]) for label, x in values.items()})
 
