@@ -24,7 +24,7 @@ MAX_DEGREE = 2
 # standard deviations from zero from which a coefficient changes in proportion, as physics do
 MIN_PROPORTIONAL_STDS = 10.0
 ROUNDS = 3  # the first finds the noise, in which the covariates had still counted
-MIN_SAMPLES_PER_COEFFICIENT = 20  # usable samples of a stretch
+MIN_SAMPLES_PER_COEFFICIENT = 20  # usable samples of a recording, or of a stretch of it
 GRID_SIZE = 201  # values of a covariate that are tried
 
 

@@ -11,13 +11,12 @@ from typing import Any
 from servoscope.core.errors import EmptyRecordingError, RecordingError
 from servoscope.models.loop import TextLayout
 from servoscope.signals.readers.guess_columns import WORDS
-from servoscope.signals.readers.layout import THOUSANDS, check_names, count_numeric, find_table
+from servoscope.signals.readers.layout import HEAD_ROWS, THOUSANDS, check_names, count_numeric, find_table
 from servoscope.signals.readers.table import NULL_TEXTS, Table, TableFile, is_number
 
 COMMENTS = ("#", "%", "//")
 DELIMITERS = (";", "\t", ",", "|", " ")
 HEAD_BYTES = 1 << 16  # that tell the layout
-HEAD_LINES = 400
 MIN_HEAD_LINES = 8  # a file of thousands of columns has fewer in so many bytes
 MAX_LINE_BYTES = 1 << 22
 LINE_ENDS = ";%"  # that stand behind each row in files of some programs
@@ -69,7 +68,7 @@ def detect_layout(path: Path, head: bytes, text: TextLayout, cut: bool = False) 
     lines = head.decode(encoding, errors="replace").splitlines()
     if cut:
         lines = lines[:-1] or lines
-    lines = lines[:HEAD_LINES]
+    lines = lines[:HEAD_ROWS]
     comments = (text.comment,) if text.comment else COMMENTS
     plain = ["" if line.lstrip().startswith(comments) else line for line in lines]
     plain[: text.skip_rows] = [""] * min(text.skip_rows, len(plain))

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.table import Table, TableFile
+from servoscope.signals.readers.table import CHUNK_ROWS, Table, TableFile
 from servoscope.signals.readers.units import with_unit
 
-CHUNK_ROWS = 1 << 16  # that are read at a time
 DEFAULT_TIME_NAME = "time"  # of a raster whose clock has no name
 
 

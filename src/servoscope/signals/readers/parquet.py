@@ -8,9 +8,8 @@ from os import SEEK_END
 from pathlib import Path
 
 from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.table import Table, TableFile, check_width, shorten_error
+from servoscope.signals.readers.table import CHUNK_ROWS, Table, TableFile, check_width, shorten_error
 
-CHUNK_ROWS = 1 << 16  # that are read at a time
 BUFFER_BYTES = 1 << 20  # of each column
 MAX_FOOTER_BYTES = 32_000_000
 FOOTER_END_BYTES = 8  # at the end of the file: the length of the footer, and PAR1

@@ -12,10 +12,8 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import RecordingError
 from servoscope.signals.readers.clock import is_clock
-from servoscope.signals.readers.layout import check_names, find_table
+from servoscope.signals.readers.layout import HEAD_ROWS, check_names, find_table
 from servoscope.signals.readers.table import Table, TableFile, check_width, is_number, shorten_error
-
-HEAD_ROWS = 400  # that tell where the table of a sheet begins
 
 
 def open_sheet(path: Path) -> TableFile:

@@ -14,10 +14,9 @@ from urllib.parse import quote
 import numpy as np
 
 from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.table import Table, TableFile, check_width, shorten_error
+from servoscope.signals.readers.table import CHUNK_ROWS, Table, TableFile, check_width, shorten_error
 from servoscope.signals.readers.topics import MAX_ARRAY_LENGTH, open_bag
 
-ROWS_AT_ONCE = 1 << 16  # of a table of a database
 MAX_DEPTH = 6  # of records within records
 
 
@@ -117,7 +116,7 @@ def open_sqlite(path: Path) -> TableFile:
         try:
             with closing(_connect(path)) as database:
                 rows, first = database.execute(query), 1
-                while piece := rows.fetchmany(ROWS_AT_ONCE):
+                while piece := rows.fetchmany(CHUNK_ROWS):
                     cells = zip(wanted, zip(*piece, strict=True), strict=True)
                     yield Table(path.name, {name: _cell_column(column) for name, column in cells}, first)
                     first += len(piece)

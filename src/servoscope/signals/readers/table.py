@@ -22,6 +22,7 @@ NULL_TEXTS = (
     "1.#QNAN",
 )
 SAMPLE_TOGETHER = "take columns of one table, topic or raster, or put them into one"
+CHUNK_ROWS = 1 << 16  # that are read at a time
 MAX_COLUMNS = 20_000  # of a file: beyond that the description of the columns is what fills the memory
 TIME_UNITS_BY_NAME = {"millitm": "ms", "msec": "ms", "ms": "ms", "milliseconds": "ms"}  # beside a time of day
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
