@@ -12,7 +12,7 @@ from servoscope.core.errors import EmptyRecordingError, RecordingError
 from servoscope.models.loop import TextLayout
 from servoscope.signals.readers.guess_columns import WORDS
 from servoscope.signals.readers.layout import HEAD_ROWS, THOUSANDS, check_names, count_numeric, find_table
-from servoscope.signals.readers.table import NULL_TEXTS, Table, TableFile, is_number
+from servoscope.signals.readers.table import NULL_TEXTS, Table, TableFile, is_number, one_line_errors
 
 COMMENTS = ("#", "%", "//")
 DELIMITERS = (";", "\t", ",", "|", " ")
@@ -249,15 +249,13 @@ def _parse_chunk(
             memory_pool=pa.system_memory_pool(),  # others keep a hundred megabytes once they are not used any more
         )
 
-    try:
+    with one_line_errors(path, "cannot be read as CSV", kinds=(pa.ArrowInvalid,)):
         # threads that still let go of a small text while Python ends would abort the process
         table = parse(len(text) > SINGLE_BLOCK_BYTES)
         if torn or comments:
             # row numbers, which messages name, exist without threads only
             torn.clear()
             table = parse(False)
-    except pa.ArrowInvalid as error:
-        raise RecordingError(f"{path}: cannot be read as CSV ({' '.join(str(error).split())[:100]})") from None
     return {name: table.column(name) for name in wanted}, torn
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.table import Table, TableFile, shorten_error
+from servoscope.signals.readers.table import Table, TableFile, one_line_errors
 from servoscope.signals.readers.units import split_unit, with_unit
 
 IN_OTHER_FILE = "lies in another file, which is not read: save all data in one file"
@@ -32,15 +32,8 @@ def _open_variables(path: Path, kind: str, load: Callable[[Path], Mapping[str, A
     """Open a file whose variables are read at once."""
     import pyarrow as pa
 
-    try:
+    with one_line_errors(path, f"is a damaged or unknown {kind} file", "save it again"):
         variables = dict(_flatten(load(path)))
-    except RecordingError:
-        raise
-    # SciPy and h5py raise nearly anything at damaged files, from MatReadError to AttributeError.
-    except Exception as error:
-        raise RecordingError(
-            f"{path}: is a damaged or unknown {kind} file ({shorten_error(error)}), save it again"
-        ) from None
     lengths = [x.size for x in variables.values() if x.size > 1]
     # The channels are the vectors of the length that most of them, and of those the longest, have.
     rows = max(lengths, key=lambda size: (lengths.count(size), size), default=0)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.table import CHUNK_ROWS, Table, TableFile
+from servoscope.signals.readers.table import CHUNK_ROWS, Table, TableFile, one_line_errors
 from servoscope.signals.readers.units import with_unit
 
 DEFAULT_TIME_NAME = "time"  # of a raster whose clock has no name
@@ -161,33 +161,23 @@ def _open_measurement(
     list_rasters: Callable[[Any], list[_Raster]],
     read: _ReadChannels,
 ) -> TableFile:
-    def damaged(error: Exception) -> RecordingError:
-        text = " ".join(str(error).split())[:80] or type(error).__name__
-        return RecordingError(f"{path}: is a damaged {kind} file ({text}), export it again")
+    damaged = path, f"is a damaged {kind} file", "export it again"
 
     def read_chunks(wanted: Sequence[str], _: Collection[str]) -> Iterator[Table]:
         import pyarrow as pa
 
         raster = next(raster for raster in rasters if {*wanted} <= {*raster.places})
-        try:
-            with opened() as file:
-                for first in range(0, raster.rows, CHUNK_ROWS):
-                    rows = min(CHUNK_ROWS, raster.rows - first)
-                    cells = {name: np.asarray(x) for name, x in read(file, raster, wanted, first, rows).items()}
-                    if len({x.shape[0] for x in cells.values()}) > 1:
-                        raise ValueError("channels end before their raster does")
-                    yield Table(
-                        path.name, {name: pa.chunked_array([_arrow_values(x)]) for name, x in cells.items()}, first + 1
-                    )
-        # both libraries raise nearly anything at damaged files
-        except Exception as error:
-            raise damaged(error) from None
+        with one_line_errors(*damaged), opened() as file:
+            for first in range(0, raster.rows, CHUNK_ROWS):
+                rows = min(CHUNK_ROWS, raster.rows - first)
+                cells = {name: np.asarray(x) for name, x in read(file, raster, wanted, first, rows).items()}
+                if len({x.shape[0] for x in cells.values()}) > 1:
+                    raise ValueError("channels end before their raster does")
+                columns = {name: pa.chunked_array([_arrow_values(x)]) for name, x in cells.items()}
+                yield Table(path.name, columns, first + 1)
 
-    try:
-        with opened() as file:
-            nonempty = [raster for raster in list_rasters(file) if raster.rows]
-    except Exception as error:
-        raise damaged(error) from None
+    with one_line_errors(*damaged), opened() as file:
+        nonempty = [raster for raster in list_rasters(file) if raster.rows]
     rasters = [raster.named() for raster in nonempty]
     names = dict.fromkeys(name for raster in rasters for name in raster.places)
     aliases = {name: raster.label(name) for raster in nonempty for name in raster.places if raster.label(name) != name}

@@ -300,6 +300,23 @@ def watch_reading(watch: Callable[[str, int, float], None]) -> Iterator[None]:
         _watch.reset(before)
 
 
+@contextmanager
+def one_line_errors(
+    path: Path | str, what: str, advice: str = "", kinds: tuple[type[Exception], ...] = (Exception,)
+) -> Iterator[None]:
+    """Turn what a library raises at a damaged file into a RecordingError of one line.
+
+    `kinds`: of its errors; most libraries raise nearly anything. `what`, `advice`: what is wrong then, and the remedy.
+    """
+    try:
+        yield
+    except RecordingError:
+        raise
+    except kinds as error:
+        why = shorten_error(error) or type(error).__name__
+        raise RecordingError(f"{path}: {what} ({why}){advice and ', '}{advice}") from None
+
+
 def shorten_error(error: Exception) -> str:
     """Return what an error of a library says, as one short line."""
     text = " ".join(str(error).split())
