@@ -15,8 +15,8 @@ from servoscope.core.messages import Message, message
 from servoscope.detection.statistic import noncentrality, required_noncentrality, t2_statistic
 from servoscope.estimation.filter_bank import filter_cutoff
 from servoscope.estimation.pipeline import Estimates, Pipeline
-from servoscope.estimation.tuning import TuningFit
 from servoscope.evidence.kind import HealthyRecordings
+from servoscope.fit.tuning import TuningFit
 from servoscope.learning.healthy_plant import PlantKnowledge
 from servoscope.learning.instrument import noise_moments
 from servoscope.learning.scatter import HealthyPaths, Scatter, forecast_covariance

@@ -10,7 +10,7 @@ from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.estimation import filter_bank
 from servoscope.estimation.filter_bank import FilterBank
 from servoscope.estimation.pipeline import Pipeline
-from servoscope.estimation.tuning import sandwich_covariance
+from servoscope.fit.tuning import sandwich_covariance
 from servoscope.learning.inspection.signals import InspectionModel
 from servoscope.models.loop import Loop, MonitorSettings
 from servoscope.models.plants import Column
