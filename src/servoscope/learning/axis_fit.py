@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 
 from servoscope.baseline.axis_model import AxisModel, AxisMoves
 from servoscope.baseline.threshold import score_limit
-from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
+from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError
 from servoscope.core.messages import Message, message
 from servoscope.estimation.axis_filter import NO_LAG, AxisFilter, AxisNoise, AxisSignals, DriveLag, axis_stride
-from servoscope.fit.search import DIFFERENCE, Experiment, fit
+from servoscope.fit.search import Experiment, fit
 from servoscope.fit.tuning import sandwich_covariance, sum_covariance
 from servoscope.isolation.ml.axis_scan import HEALTHY_MARGIN, largest_changes, scan_limit
 from servoscope.isolation.ml.axis_vibration import BANDS
@@ -38,10 +37,9 @@ MIN_SAMPLES_PER_COLUMN = 10  # samples in motion
 DELAYS_S, LAGS_S = np.arange(0.0, 0.1, 0.01), (0.0, 0.01, 0.02, 0.04, 0.08)  # that are tried first
 MIN_DRIVE_GAIN = 50.0  # of twice the log-likelihood, for a delay and a lag
 MIN_DRIVE_S = 5e-3  # of both together: less is what the sampling or a compliant coupling does
-MAX_NOISE_ROUNDS = 4  # of the noise, and of the innovations that count with it, in turns
-MAX_LOG_RATIO = 12.0  # of the force's standard deviation to that of y's noise, relative to its start
+MAX_DRIVE_ROUNDS = 3  # of delay and lag, and noise, in turns
 DRIVE_DIFFERENCE = 0.02  # samples of delay and lag, for derivatives: a lag below half of it is none
-OF_NOISE = np.arange(2)  # the unknowns of an experiment that are those of the noise
+STEPS, FIRST_STEP = 250, 0.7  # of the search for the noise: steps, and the logarithm of the first ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +64,13 @@ class AxisRegression:
         own = [-np.linspace(-0.5, 0.5, N)] if "offset" in plant.terms else [-np.ones(N), -np.linspace(-0.5, 0.5, N)]
         return cls(signals, np.vstack([signals.columns(plant), *own]))
 
-    def regress(self, filter: AxisFilter, where: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Return regressors (N, p) and target (N,) of the innovations that count."""
+    def regress(self, noise: AxisNoise, rest_speed: float) -> tuple[FloatArray, FloatArray, AxisFilter]:
+        """Return regressors (N, p) and target (N,) of the innovations that count, in standard deviations."""
+        filter = AxisFilter.design(noise, self.signals.sample_rate, self.signals.derivative)
+        where = self.signals.moving(rest_speed, filter.settling)
         X = filter.of_acceleration(self.columns, self.signals.runs)[:, where].T
-        return X, filter.of_output(self.signals.y, self.signals.runs)[where]
+        e = filter.of_output(self.signals.y, self.signals.runs)[where]
+        return X / np.sqrt(filter.variance), e / np.sqrt(filter.variance), filter
 
 
 def rest_speed(signals: Sequence[AxisSignals]) -> float:
@@ -89,126 +90,118 @@ def check_motion(recordings: Sequence[Recording], signals: Sequence[AxisSignals]
             )
 
 
-@dataclass(frozen=True, eq=False)
-class AxisExperiment:
-    """Healthy recordings as a function of the noise's colour and of how late the force is.
+def fit_axis_noise(problems: Sequence[AxisRegression], slow: float) -> AxisNoise:
+    """Return the noise that makes the innovations likeliest, each recording with coefficients of its own.
 
-    Unknowns are, in this order: the logarithms of the force's standard deviation relative to that of y's noise, and of
-    its correlation time, both relative to `noise`; samples of delay and of lag. Each recording has coefficients of its
-    own, and the level of the noise is concentrated out.
+    Raises LinAlgError where the signals say nothing.
     """
-
-    loop: Loop
-    recordings: Sequence[Recording]
-    problems: Sequence[AxisRegression]  # with a force that is not late
-    slow: float
-    moves: AxisMoves | None
-    noise: AxisNoise
-    drive: DriveLag = NO_LAG
-
-    @property
-    def rate(self) -> float:
-        """Sample rate of the filter [Hz]."""
-        return self.problems[0].signals.sample_rate
-
-    @cached_property
-    def filter(self) -> AxisFilter:
-        """The filter of `noise`."""
-        return AxisFilter.design(self.noise, self.rate, self.problems[0].signals.derivative)
-
-    def at(self, x: FloatArray) -> AxisExperiment:
-        """Return the same recordings with a noise and a drive, the noise at the level of `noise`."""
-        ratio, time = np.exp(x[:2]).tolist()
-        noise = self.noise._replace(
-            acceleration_std=ratio * self.noise.acceleration_std, correlation_s=time * self.noise.correlation_s
-        )
-        return replace(self, noise=noise, drive=DriveLag(*(x[2:] / self.rate).tolist()))
-
-    def innovations(self, x: FloatArray) -> FloatArray:
-        """Return innovations whose sum of squares ranks as the likelihood does, shape (N,)."""
-        at, unexplained = self.at(x), []
-        for problem in at.late:
-            # which innovations count is the same throughout a search
-            X, e = problem.regress(at.filter, problem.signals.moving(self.slow, self.filter.settling))
-            Q = np.linalg.qr(X)[0]
-            unexplained.append(e - Q @ (Q.T @ e))
-        return np.concatenate(unexplained)
-
-    @property
-    def late(self) -> Sequence[AxisRegression]:
-        """The recordings, the force as late as `drive`."""
-        if not any(self.drive):
-            return self.problems
-        stride = round(self.loop.sample_rate / self.rate)
-        forces = [axis_signals(self.loop, rec, stride, self.drive, self.moves).force for rec in self.recordings]
-        return [
-            replace(problem, columns=np.vstack([force, problem.columns[1:]]))
-            for problem, force in zip(self.problems, forces, strict=True)
-        ]
-
-    @cached_property
-    def search(self) -> Experiment:
-        """The experiment that is searched."""
-        times = np.log([0.1 / self.rate, max(MAX_FORCE_CORRELATION_S, 1.0 / self.rate)])
-        low, high = times - np.log(self.noise.correlation_s)
-        return Experiment(
-            self.innovations,
-            np.full(4, np.inf),
-            level_known=False,
-            low=np.array([-MAX_LOG_RATIO, low, 0.0, 0.0]),
-            high=np.array([MAX_LOG_RATIO, high, np.inf, np.inf]),
-            difference=np.array([DIFFERENCE, DIFFERENCE, DRIVE_DIFFERENCE, DRIVE_DIFFERENCE]),
-        )
-
-    def likeliest(self, free: IndexArray) -> AxisExperiment:
-        """Return it with the likeliest unknowns; anew while its filter forgets a reversal sooner or later than before.
-
-        Raises LinAlgError where the signals say nothing.
-        """
-        at = self
-        for _ in range(MAX_NOISE_ROUNDS):
-            before, fitted = at, fit(at.search, np.array([0.0, 0.0, *(np.array(at.drive) * at.rate)]), free)
-            if not np.isfinite(fitted.cost):
-                raise np.linalg.LinAlgError("the innovations are not finite")
-            at = before.at(fitted.x)
-            level = float(np.sqrt(np.mean(fitted.residual**2) / at.filter.variance))
-            force, time, y = at.noise
-            at = replace(at, noise=AxisNoise(level * force, time, level * y))
-            if at.filter.settling == before.filter.settling:
-                break
-        return at
-
-
-def fit_noise_and_drive(experiment: AxisExperiment) -> AxisExperiment:
-    """Return the likeliest noise, and how late the force is; a lag that explains little is none.
-
-    A grid comes before the search, for the likelihood has several maxima along delay and lag.
-    """
-    prompt = experiment.likeliest(OF_NOISE)
-    grid = [np.array([0.0, 0.0, delay, lag]) for delay in DELAYS_S for lag in LAGS_S]
-    costs = [prompt.search.at(x * prompt.rate).cost for x in grid]
-    late = fit(prompt.search, grid[int(np.argmin(costs))] * prompt.rate)
-    drive = prompt.at(late.x)
-    if costs[0] - late.cost <= MIN_DRIVE_GAIN or sum(drive.drive) <= max(MIN_DRIVE_S, 1.0 / prompt.rate):
-        return prompt
-    return drive.likeliest(np.arange(len(late.x)))
-
-
-def rough_noise(problems: Sequence[AxisRegression]) -> AxisNoise:
-    """Return the noise that a search begins with."""
+    from scipy.optimize import minimize
     from scipy.signal import savgol_filter
 
     rate = problems[0].signals.sample_rate
     accelerations = [np.gradient(problem.signals.speed, 1.0 / rate) for problem in problems]
     rough = np.concatenate([problem.signals.y - savgol_filter(problem.signals.y, 5, 2) for problem in problems])
     size = float(np.sqrt(np.mean(np.concatenate(accelerations) ** 2)))
-    return AxisNoise(0.2 * size, 1.0 / rate, max(float(rough.std()), 1e-12 * size))
+    start = np.log([0.2 * size, 1.0 / rate, max(float(rough.std()), 1e-12 * size)])
+    bounds = [
+        (start[0] - 7.0, start[0] + 5.0),
+        tuple(np.log([0.1 / rate, max(MAX_FORCE_CORRELATION_S, 1.0 / rate)])),
+        (start[2] - 9.0, start[2] + 3.0),
+    ]
+
+    first = 0
+
+    def cost(x: FloatArray) -> float:
+        nonlocal first
+        total, count = 0.0, 0
+        for problem in problems:
+            X, e, filter = problem.regress(AxisNoise(*np.exp(x).tolist()), slow)
+            left = e - X @ np.linalg.lstsq(X, e, rcond=None)[0]
+            total += len(e) * float(np.log(filter.variance)) + float(left @ left)
+            count += len(e)
+        first = first or count
+        # a filter that forgets a reversal sooner counts more innovations, which makes it no likelier
+        return total * first / max(count, 1)
+
+    # a simplex of its own size: SciPy's is a share of the logarithms, and so depends on the unit of y
+    simplex = np.vstack([start, start + FIRST_STEP * np.eye(len(start))])
+    optimize_result = minimize(
+        cost,
+        start,
+        method="Nelder-Mead",
+        bounds=bounds,
+        options={"maxiter": STEPS, "xatol": 0.02, "fatol": 0.5, "initial_simplex": simplex},
+    )
+    return AxisNoise(*np.exp(optimize_result.x).tolist())
+
+
+def _fit_drive_and_noise(
+    loop: Loop, recordings: Sequence[Recording], stride: int, slow: float, moves: AxisMoves | None
+) -> tuple[DriveLag, AxisNoise, list[AxisRegression]]:
+    """Return how late the force is, the noise, and the regressions with both; a lag that explains little is none."""
+    plant, drive = loop.plant, NO_LAG
+    assert isinstance(plant, AxisPlant)
+
+    def regressions(drive: DriveLag) -> list[AxisRegression]:
+        return [
+            AxisRegression.of(plant, axis_signals(loop, recording, stride, drive, moves)) for recording in recordings
+        ]
+
+    noise = fit_axis_noise(regressions(drive), slow)
+    for _ in range(MAX_DRIVE_ROUNDS):
+        later = fit_drive(loop, recordings, regressions(drive), noise, slow, drive, moves)
+        if later == drive:
+            break
+        drive = later
+        noise = fit_axis_noise(regressions(drive), slow)
+    return drive, noise, regressions(drive)
+
+
+def fit_drive(
+    loop: Loop,
+    recordings: Sequence[Recording],
+    problems: Sequence[AxisRegression],
+    noise: AxisNoise,
+    slow: float,
+    known: DriveLag,
+    moves: AxisMoves | None = None,
+) -> DriveLag:
+    """Return the delay and lag of the force behind u that make the innovations smallest, `known` where none matters.
+
+    Each recording has coefficients of its own. All columns but that of u stay, so that their directions are taken off
+    once; a grid comes before the search, for the sum of squares has several minima.
+    """
+    rate, stride = loop.sample_rate, round(loop.sample_rate / problems[0].signals.sample_rate)
+    fixed = []
+    for recording, problem in zip(recordings, problems, strict=True):
+        X, e, filter = problem.regress(noise, slow)
+        Q = np.linalg.qr(X[:, 1:])[0]
+        where = problem.signals.moving(slow, filter.settling)
+        fixed.append((recording, Q, e - Q @ (Q.T @ e), filter, where, problem.signals.runs))
+
+    def unexplained(x: FloatArray) -> FloatArray:
+        parts = []
+        for recording, Q, e, filter, where, runs in fixed:
+            u = axis_signals(loop, recording, stride, DriveLag(*(x / rate).tolist()), moves).force
+            column = filter.of_acceleration(u, runs)[where]
+            column = column - Q @ (Q.T @ column)
+            parts.append(e - column * (float(column @ e) / max(float(column @ column), np.finfo(np.float64).tiny)))
+        return np.concatenate(parts)
+
+    unknown = np.full(2, np.inf)  # samples of delay and lag
+    experiment = Experiment(unexplained, unknown, level_known=False, low=0.0, difference=DRIVE_DIFFERENCE)
+    before = experiment.at(rate * np.array(known))
+    grid = [rate * np.array([delay, lag]) for delay in DELAYS_S for lag in LAGS_S]
+    start = min([before, *map(experiment.at, grid)], key=lambda tried: tried.cost)
+    likely = fit(experiment, start.x)
+    late = DriveLag(*(likely.x / rate).tolist())
+    matters = before.cost - likely.cost > MIN_DRIVE_GAIN and sum(late) > max(MIN_DRIVE_S, 1.0 / rate)
+    return late if matters else known
 
 
 def fit_recording(problem: AxisRegression, noise: AxisNoise, slow: float) -> AxisFit:
     """Return the coefficients of one recording by least squares on its innovations."""
-    filter = AxisFilter.design(noise, problem.signals.sample_rate, problem.signals.derivative)
-    X, e = problem.regress(filter, problem.signals.moving(slow, filter.settling))
+    X, e, _ = problem.regress(noise, slow)
     scaled, size = normalise_columns(X)
     theta, *_ = np.linalg.lstsq(scaled, e, rcond=None)
     left = e - scaled @ theta
@@ -227,12 +220,11 @@ def fit_axis(
     """
     plant, stride = loop.plant, axis_stride(loop.sample_rate)
     assert isinstance(plant, AxisPlant)
-    signals = [axis_signals(loop, recording, stride, NO_LAG, moves) for recording in recordings]
+    signals = [axis_signals(loop, recording, stride) for recording in recordings]
     slow = rest_speed(signals)
     check_motion(recordings, signals, slow, 1 + len(plant.acting))
-    problems = [AxisRegression.of(plant, signal) for signal in signals]
-    fitted = fit_noise_and_drive(AxisExperiment(loop, recordings, problems, slow, moves, rough_noise(problems)))
-    fits = [fit_recording(problem, fitted.noise, slow) for problem in fitted.late]
+    drive, noise, problems = _fit_drive_and_noise(loop, recordings, stride, slow, moves)
+    fits = [fit_recording(problem, noise, slow) for problem in problems]
     names = ("inertia", *(column.coefficient for column in plant.acting))
     center, of_center = combine_fits(fits, len(names))
     # in physical units, linear around the common coefficients: u alone may hardly show in a recording
@@ -261,8 +253,8 @@ def fit_axis(
         coefficients=coefficients,
         parameters=tuple(names[i] for i in known),
         covariance=tuple(tuple(row) for row in covariance.tolist()),
-        noise=fitted.noise,
-        drive=fitted.drive,
+        noise=noise,
+        drive=drive,
         stride=stride,
         rest_speed=slow,
         offset_std=FORCE_OFFSET_SHARE * force,
