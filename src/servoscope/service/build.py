@@ -157,12 +157,9 @@ def open_source(config: ServiceFile, name: str, source: Inbox, assets: Mapping[s
 
 def resume_positions(config: ServiceFile, source: str, assets: Mapping[str, Asset]) -> dict[str, ResumePosition]:
     """Return where the assets of a source, by its name, go on."""
-    inboxes = {}
-    for name, asset in assets.items():
-        if config.assets[name].source == source and asset.state is not None and asset.heard:
-            position = asset.state.position
-            inboxes[name] = ResumePosition(position.sequence, position.began, position.stream, position.t)
-    return inboxes
+    own = {name: asset.state for name, asset in assets.items() if config.assets[name].source == source and asset.heard}
+    counted = {name: state.position for name, state in own.items() if state is not None}
+    return {name: ResumePosition(at.sequence, at.began, at.stream, at.t) for name, at in counted.items()}
 
 
 def build_assets(config: ServiceFile) -> dict[str, Asset]:

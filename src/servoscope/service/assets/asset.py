@@ -47,6 +47,7 @@ from servoscope.service.assets.records import (
 )
 from servoscope.service.assets.states import AssetStates, RestPeriod, StateHolder
 from servoscope.service.assets.status import Announcement, AssetStatus, asset_metadata, asset_status
+from servoscope.service.clock import LayerTimes
 from servoscope.service.config import DiagnosisSettings
 from servoscope.service.sources.block import Block
 from servoscope.service.store.bundles import pack_samples
@@ -124,7 +125,8 @@ class Asset(StateHolder):
     def compile_kernels(self) -> None:
         """Compile what blocks need, so that the first one does not wait for it."""
         nothing, monitor = np.full(2, np.nan), self.monitor
-        monitor.run(monitor.init(), *(nothing,) * 3, channels=dict.fromkeys(self.baseline.logged_covariates, nothing))
+        channels = dict.fromkeys(self.baseline.logged_covariates, nothing)
+        monitor.run_lanes(monitor.init()[None], *(nothing,) * 3, channels=channels)
         quality.check_block(self._limits, quality.init_state(), np.arange(2.0), nothing, nothing, nothing)
 
     def resume(self, state: AssetState, stored: Iterable[Block]) -> list[Block]:
@@ -186,13 +188,15 @@ class Asset(StateHolder):
         first = self._window.first_sequence
         return self.take_state().position.blocks if first is None else first
 
-    def process(self, block: Block, latest: float = math.inf) -> StepResult:
+    def process(self, block: Block, latest: float = math.inf, layers: LayerTimes | None = None) -> StepResult:
         """Process a block; one that was counted before has no effect, nor has one that is later than `latest` [UTC s].
 
         Raises RecordingError if it is no block: empty, without time, or of signals of different lengths.
         """
         accepted = self.accept(block, latest)
-        return accepted if isinstance(accepted, StepResult) else self.conclude(accepted, self.follow(accepted))
+        if isinstance(accepted, StepResult):
+            return accepted
+        return self.conclude(accepted, self.follow(accepted, layers or LayerTimes()))
 
     def accept(self, block: Block, latest: float = math.inf) -> NextBlock | StepResult:
         """Begin to process a block, as `process` does: return what is to be followed and concluded, or no effect."""
@@ -213,10 +217,10 @@ class Asset(StateHolder):
             return self._leave_out(block, "late", behind_s=position.t - start)
         return NextBlock(block, continuity)
 
-    def follow(self, accepted: NextBlock) -> Followed:
+    def follow(self, accepted: NextBlock, layers: LayerTimes) -> Followed:
         """Follow an accepted block alone."""
-        restart = accepted.continuity.is_broken
-        return self.lanes.follow(self.monitor, self.take_state(), accepted.block.signals, restart=restart)
+        state, restart = self.take_state(), accepted.continuity.is_broken
+        return self.lanes.follow(self.monitor, state, accepted.block.signals, restart, layers)
 
     def conclude(self, accepted: NextBlock, followed: Followed) -> StepResult:
         """Take what an accepted block has led to."""
