@@ -285,18 +285,18 @@ def _resolve_limits(baseline: AnyBaseline, limits: Mapping[str, float | LimitKin
 
 def source_assets(config: ServiceFile, assets: Mapping[str, Asset], source: str) -> dict[str, SourceAsset]:
     """Return what a source is told of its assets."""
-    key, sources = config.sources[source].asset_key, dict[str, SourceAsset]()
-    for name, asset in config.assets.items():
-        if asset.source == source:
-            baseline, address = assets[name].baseline, getattr(asset, key) if key else None
-            sources[name] = SourceAsset(
-                baseline.loop.carrier if isinstance(baseline, ArmBaseline) else baseline.loop,
-                address,
-                config.service.ahead_s,
-                baseline.logged_covariates,
-                is_arm=isinstance(baseline, ArmBaseline),
-            )
-    return sources
+    key = config.sources[source].asset_key
+    own = {name: assets[name].baseline for name, asset in config.assets.items() if asset.source == source}
+    return {
+        name: SourceAsset(
+            baseline.loop.carrier if isinstance(baseline, ArmBaseline) else baseline.loop,
+            getattr(config.assets[name], key) if key else None,
+            config.service.ahead_s,
+            baseline.logged_covariates,
+            is_arm=isinstance(baseline, ArmBaseline),
+        )
+        for name, baseline in own.items()
+    }
 
 
 def build_source(config: ServiceFile, assets: Mapping[str, Asset], name: str) -> Inbox:

@@ -136,8 +136,6 @@ class CPrinter:
         """Write a comparison of whole numbers."""
         return self._assign(f"{a} {self.OPERATORS.get(sign, sign)} {b}", "i1")
 
-    combine = operate
-
     def select(self, condition_kind: str, condition: str, kind: str, a: str, b: str) -> str:
         """Write a where the condition holds, b where not."""
         return self._assign(self.SELECT.format(condition, a, b), kind)

@@ -129,10 +129,6 @@ class LlvmPrinter:
         """Write a comparison of whole numbers."""
         return self.assign(f"icmp {'s' * (sign != '==')}{COMPARISONS[sign]} i64 {a}, {b}")
 
-    def combine(self, name: str, kind: str, a: str, b: str) -> str:
-        """Write that both conditions hold, or one of them."""
-        return self.assign(f"{name} {kind} {a}, {b}")
-
     def select(self, condition_kind: str, condition: str, kind: str, a: str, b: str) -> str:
         """Write a where the condition holds, b where not."""
         return self.assign(f"select {condition_kind} {condition}, {kind} {a}, {kind} {b}")

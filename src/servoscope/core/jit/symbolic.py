@@ -25,10 +25,10 @@ class Bool:
     kind: str
 
     def __and__(self, other: Bool) -> Bool:
-        return Bool(self.printer, self.printer.combine("and", self.kind, self.text, other.text), self.kind)
+        return Bool(self.printer, self.printer.operate("and", self.kind, self.text, other.text), self.kind)
 
     def __or__(self, other: Bool) -> Bool:
-        return Bool(self.printer, self.printer.combine("or", self.kind, self.text, other.text), self.kind)
+        return Bool(self.printer, self.printer.operate("or", self.kind, self.text, other.text), self.kind)
 
     def __invert__(self) -> Bool:
         return Bool(self.printer, self.printer.opposite(self.kind, self.text), self.kind)
