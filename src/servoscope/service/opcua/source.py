@@ -35,7 +35,6 @@ from servoscope.service.opcua.subscriptions import (
     ItemTerms,
     ScalarSubscription,
     monitor_nodes,
-    publishing_interval,
     shorten_interval,
     timestamp,
 )
@@ -244,7 +243,8 @@ class OpcuaTransport(ThreadTransport):
 
         A server may grant less than it was asked for: where its queues are shorter, messages have to come sooner.
         """
-        period, heartbeat = publishing_interval(subscription), self.settings.heartbeat
+        period = float(subscription.parameters.RequestedPublishingInterval) / 1000.0  # as the server has revised it [s]
+        heartbeat = self.settings.heartbeat
         wanted = {
             node: ItemTerms(subscription.sampling_ms, subscription.queue_size(period))
             for subscription in self._subscriptions
