@@ -360,13 +360,7 @@ class Monitor:
         """Return what the state of one asset knows of its covariates: by name, seconds before now, and values then."""
         return self._sides.first.covariate_history(state[self._side_at :])
 
-    def _trace(
-        self,
-        out: npt.NDArray[Any],
-        index: npt.NDArray[np.int64],
-        first: int,
-        beside: SideValues,
-    ) -> Trace:
+    def _trace(self, out: npt.NDArray[Any], index: npt.NDArray[np.int64], first: int, beside: SideValues) -> Trace:
         """Return complete evaluations, shape (assets, K, row), as a trace; the block begins at sample `first`."""
         features = None if beside.features is None else beside.features.at(index)
         n, f = len(self._constants_of[0].expected_theta), np.asarray(self.loop.monitor.frequencies, dtype=np.float64)

@@ -167,7 +167,7 @@ def write_asset_series(assets: Mapping[str, Asset]) -> AssetSeries:
             last.append(f"servoscope_last_sample_time_seconds{{{label}}} {position.t}")
         verdict = asset_verdict(state.examination, quality.active_findings(state.quality), reception)
         verdicts.append(f'servoscope_verdict{{{label},verdict="{verdict}"}} 1.0')
-        alarms.update(asset.standing_alarms(state))
+        alarms.update(asset.alarms.standing(state.alarms))
     families = [(f"{key}_total", "counter", STREAM_COUNTERS[key], lines) for key, lines in counts.items()]
     families += [
         ("last_sample_time_seconds", "gauge", "Time of the last sample", last),

@@ -91,7 +91,7 @@ class Asset(StateHolder):
         self._metadata = asset_metadata(baseline, group, policy.diagnosis.window_s, source)
         self._limits = policy.quality.limits(self._rate, policy.pause_s)
         self.lanes = BlockLanes(self._rate, self._limits, policy.residual_every_s)
-        self._alarms = AssetAlarms(policy.alarms, policy.prognosis.ahead_s, limited=bool(policy.limits))
+        self.alarms = AssetAlarms(policy.alarms, policy.prognosis.ahead_s, limited=bool(policy.limits))
         self._window = RecentBlocks(name, policy.diagnosis.kept_s, self._rate)
         self._result, self._reception = StepResult([], []), RECEPTION_OK
         self._ticked = False  # whether silence has changed the state since the last block
@@ -100,7 +100,7 @@ class Asset(StateHolder):
         """Let the state be a row of `states`, until it is taken or another one is set."""
         state = self.take_state()
         since, until = rest_period(state.examination)
-        from_s, to_s = self._alarms.standstill(state, self.reception)
+        from_s, to_s = self.alarms.standstill(state, self.reception)
         undisturbed = self.reception == RECEPTION_OK and not self._ticked
         period = RestPeriod(state.examination.verdict == "fault", max(since, from_s), min(until, to_s))
         self._row = states.put(row, state, period if undisturbed else period._replace(until=-math.inf))
@@ -118,9 +118,9 @@ class Asset(StateHolder):
 
     def announce(self, announced: Announcement | None) -> None:
         """Let it learn again after what was done to it; None: it has learned."""
-        if announced != self._alarms.announced and self._state is not None:
+        if announced != self.alarms.announced and self._state is not None:
             self.take_state()
-        self._alarms.announced = announced
+        self.alarms.announced = announced
 
     def compile_kernels(self) -> None:
         """Compile what blocks need, so that the first one does not wait for it."""
@@ -142,7 +142,7 @@ class Asset(StateHolder):
                 f"run --anew {self.name} begins with a new state, behind the samples counted"
             )
         t = state.position.t
-        alarms = self._alarms.begin(self.name, t, state.alarms)
+        alarms = self.alarms.begin(self.name, t, state.alarms)
         self.state = replace(state, alarms=alarms, quality=quality.restart_silence(state.quality, t))
         position, blocks = state.position, list(stored)
         counted = [block for block in blocks if block.sequence < position.blocks]
@@ -166,7 +166,7 @@ class Asset(StateHolder):
             quality=quality.init_state(),
             examination=ExaminationState.begin(position.t, self.policy.diagnosis, self._phase, self.policy.assets),
             # those that stand since before the first block go on
-            alarms=self._alarms.begin(self.name, position.t, standing),
+            alarms=self.alarms.begin(self.name, position.t, standing),
         )
 
     def expect(self, now: float) -> None:
@@ -175,12 +175,8 @@ class Asset(StateHolder):
 
     def status(self, state: AssetState) -> AssetStatus:
         """Return what users see of a state."""
-        about = self._alarms.definitions, self._metadata, self.reception, self._alarms.announced
+        about = self.alarms.definitions, self._metadata, self.reception, self.alarms.announced
         return asset_status(state, *about, self.policy.diagnosis.kept_s)
-
-    def standing_alarms(self, state: AssetState) -> list[tuple[str, str, str]]:
-        """Return name, priority and state of each alarm that is not normal."""
-        return self._alarms.standing(state.alarms)
 
     @property
     def first_needed_sequence(self) -> int:
@@ -275,7 +271,7 @@ class Asset(StateHolder):
         Raises AlarmError if there is no such alarm, or the command has no meaning in its state.
         """
         self._result = StepResult([], [])
-        self.state, transitions = self._alarms.execute(self.take_state(), alarm, command)
+        self.state, transitions = self.alarms.execute(self.take_state(), alarm, command)
         self._add_transitions(transitions)
         return self._result
 
@@ -365,7 +361,7 @@ class Asset(StateHolder):
         """Examine the last minutes if that is due, and request a full diagnosis of a new fault."""
         state, settings = self.take_state(), self.policy.diagnosis
         t, known = state.position.t, state.examination
-        details = state.evaluation.features, single_fault(known.faults), known.verdict, self._alarms.assesses
+        details = state.evaluation.features, single_fault(known.faults), known.verdict, self.alarms.assesses
         if is_at_rest(known, t, state.evaluation.exceeded):
             return
         recent = partial(self._window.after, t - settings.window_s)
@@ -395,10 +391,10 @@ class Asset(StateHolder):
 
     def _advance_alarms(self, t: float) -> None:
         """Update the alarms at time `t` [UTC s]."""
-        self.state, transitions = self._alarms.advance(self.take_state(), self.reception, t)
+        self.state, transitions = self.alarms.advance(self.take_state(), self.reception, t)
         self._add_transitions(transitions)
 
     def _add_transitions(self, transitions: Sequence[AlarmTransition]) -> None:
         self._result.transitions.extend(transitions)
         for transition in transitions:
-            self._add_row("transitions", **transition_row(transition, self._alarms.definitions[transition.alarm]))
+            self._add_row("transitions", **transition_row(transition, self.alarms.definitions[transition.alarm]))
