@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 
-import servoscope as ss
 from studies.recordings import RIG, ROOT, Judged
+
+import servoscope as ss
 
 LOADS = ("20", "40", "-40")  # kgf, of the ball screw
 
