@@ -4,7 +4,7 @@ No model is exact: in healthy recordings too, the residual e = eta - phi' theta 
 position and acceleration. This mean is taken out. What is left by classes of speed, its correlation with acceleration
 and position, and its rms scatter between healthy recordings; how far a further recording is from them is T^2/d of
 `GroupStatistic`. The second half of a recording is compared with the first, too: what differs from day to day is in
-both.
+both. Where coefficients of a recording are compared with healthy ones, so are those of all its samples.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from servoscope.baseline.feature_model import FeatureGroup, GroupStatistic, is_n
 from servoscope.baseline.records import BaselineModel, Matrix, Vector
 from servoscope.core import outofcore
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray, to_tuples
-from servoscope.estimation.pipeline import Pipeline, RegressionRunner
+from servoscope.estimation.pipeline import Pipeline, Regression, RegressionRunner
+from servoscope.models.lti import solve_scaled
 from servoscope.signals import Recording
 
 SPEED_SHARES = (0.02, 0.1, 0.4, 0.8)  # of the top speed: the classes of speed in either direction
@@ -31,6 +32,7 @@ SIZE = CLASSES + CORRELATIONS + 1  # number of features
 FADE_S = 0.1  # time in a class at which its mean counts half
 SAME_MOTION_RATIO = 1.6  # of rms position, speed and acceleration of r, up to which two recordings move alike
 MIN_SHARE = 1e-4  # of the rms of eta: a smaller difference is no evidence
+MIN_COLUMN_SHARE = 0.05  # of the rms that a column has when healthy: with less it tells nothing of its coefficient
 
 
 class ResidualSamples(NamedTuple):
@@ -148,6 +150,8 @@ class ResidualModel(BaselineModel):
     limits: tuple[float, float] = (1.0, 1.0)  # of T^2/d
     # covariance (n, n) of coefficients fitted to half a recording, about the healthy ones; empty where not compared
     halves: Matrix = Field(default=(), exclude_if=lambda value: not value)
+    rms: Vector = Field(default=(), exclude_if=lambda value: not value)  # of each column when healthy
+    fit_limit: float = Field(default=np.inf, exclude_if=np.isinf)  # of T^2/n of the coefficients of a whole recording
 
     @classmethod
     def of(cls, layout: ResidualLayout, healthy: Sequence[RecordingResidual]) -> Self:
@@ -197,6 +201,22 @@ class ResidualModel(BaselineModel):
         More than half a recording is not surer: what differs from day to day does not average.
         """
         return np.array(self.halves) * max(1.0, 0.5 * self.samples / max(samples, 1.0))
+
+
+def mean_t2(deviation: FloatArray, covariance: FloatArray) -> float:
+    """Return d' C^-1 d/n of the n entries of a deviation that are known: Hotelling's statistic."""
+    known = np.flatnonzero(np.isfinite(deviation))
+    d = deviation[known]
+    return float(d @ solve_scaled(covariance[np.ix_(known, known)], d)) / max(len(known), 1)
+
+
+def fit_coefficients(g: Regression, rms: FloatArray) -> FloatArray:
+    """Return least squares over the usable samples, (n,); NaN where a column is hardly there, by its healthy rms."""
+    phi, z, eta = g.phi[g.ok], g.z[g.ok], g.eta[g.ok]
+    theta = np.full(phi.shape[1], np.nan)
+    known = np.flatnonzero((phi**2).sum(axis=0) > len(phi) * (MIN_COLUMN_SHARE * rms) ** 2)
+    theta[known] = solve_scaled(z[:, known].T @ phi[:, known], z[:, known].T @ eta)
+    return theta
 
 
 def _expected_shift(statistic: GroupStatistic, residual: RecordingResidual) -> FloatArray:

@@ -20,6 +20,7 @@ from servoscope.baseline.covariates import CovariatePath
 from servoscope.baseline.expectation import Expectation, ReferencePath, reference_path, residual_noise_model
 from servoscope.baseline.motion import RecordedMotion
 from servoscope.baseline.pressure_model import PressureEvidence
+from servoscope.baseline.residual_model import fit_coefficients, mean_t2
 from servoscope.core import outofcore
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import RecordingError
@@ -43,6 +44,7 @@ MAX_COVARIATE_T2 = 1.0  # T^2 of what covariates do within a recording, from whi
 AT_ONCE = 4096  # evaluations
 FORGOTTEN_SHARE = 1e-9  # share of the past below which it counts as forgotten
 MEMORIES = 22.0  # after which it usually is
+MIN_SAMPLES_PER_COEFFICIENT = 20  # usable samples that are fitted
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,9 +162,32 @@ class Examination:
 
     @cached_property
     def residual_ratios(self) -> FloatArray:
-        """What the healthy coefficients leave of u over its limits, see `ResidualModel.ratios`; NaN: no evidence."""
+        """What the healthy coefficients leave of u over its limits, and how far a fit is from them, shape (3,).
+
+        See `ResidualModel.ratios`; NaN: no evidence.
+        """
         model = None if self.quick else self.baseline.residual
-        return np.full(2, np.nan) if model is None else model.ratios_of(self.pipeline, self.recording)
+        if model is None:
+            return np.full(3, np.nan)
+        ratios = model.ratios_of(self.pipeline, self.recording)
+        fit = self.deviation_of_rows(slice(None)) if np.isfinite(ratios).any() else None
+        return np.append(ratios, np.nan if fit is None else mean_t2(*fit) / model.fit_limit)
+
+    def deviation_of_rows(self, rows: slice) -> tuple[FloatArray, FloatArray] | None:
+        """Return theta of some rows minus its healthy expectation, (n,), and how such fits scatter, (n, n).
+
+        NaN where the rows do not show a coefficient; None where they are few, or healthy fits were not compared.
+        """
+        model, part = self.baseline.residual, self.recording.rows(rows)
+        if model is None or not model.halves:
+            return None
+        g = self.pipeline.regression(part.r, part.u, part.y, part.restart)
+        if (samples := int(g.ok.sum())) < MIN_SAMPLES_PER_COEFFICIENT * g.phi.shape[1]:
+            return None
+        expected = np.array(self.baseline.theta)
+        if self.along is not None:
+            expected = self.along.expected(np.arange(self.recording.samples)[rows][g.ok]).mean(axis=0)
+        return fit_coefficients(g, np.array(model.rms or 0.0)) - expected, model.stretch_covariance(samples)
 
     @cached_property
     def pressures(self) -> PressureEvidence | None:
