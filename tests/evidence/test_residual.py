@@ -127,6 +127,10 @@ def test_a_fit_of_all_samples_shows_what_the_residual_hides(learned: ss.Baseline
     assert [fault.name for fault in diagnosis.faults] == ["lag"]
     assert any("a fit of the coefficients" in str(reason) for reason in diagnosis.reasons)
     assert all(ratios(baseline, day(seed))[2] < 1.0 for seed in range(30, 34))
+    # what is promised is what a fit shows, and half as much does not
+    changes = {change.name: change.change or np.inf for change in baseline.detectability.changes}
+    for ratio, shows in ((1.0 - 1.5 * changes["valve_forward"], True), (1.0 - 0.5 * changes["valve_forward"], False)):
+        assert (ratios(baseline, day(47, FaultEvent("gain_extend", ratio, 0.0)))[2] > 1.0) == shows
 
 
 def test_a_coefficient_that_rows_do_not_show_counts_nothing(learned: ss.Baseline) -> None:

@@ -9,7 +9,7 @@ both. Where coefficients of a recording are compared with healthy ones, so are t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple, Self
 
@@ -201,6 +201,17 @@ class ResidualModel(BaselineModel):
         More than half a recording is not surer: what differs from day to day does not average.
         """
         return np.array(self.halves) * max(1.0, 0.5 * self.samples / max(samples, 1.0))
+
+    def detectable_changes(self, directions: Mapping[str, FloatArray], covariance: FloatArray) -> dict[str, float]:
+        """Return the smallest relative changes that leave the limit of the fit, by parameter; infinite: none does.
+
+        `directions`: what a relative change adds to the coefficients, (n,); `covariance`: of the fit, (n, n).
+        """
+        with np.errstate(divide="ignore"):
+            sizes = {
+                name: len(d) * self.fit_limit / (d @ solve_scaled(covariance, d)) for name, d in directions.items()
+            }
+        return {name: float(np.sqrt(size)) for name, size in sizes.items()}
 
 
 def mean_t2(deviation: FloatArray, covariance: FloatArray) -> float:

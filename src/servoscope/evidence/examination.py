@@ -169,9 +169,14 @@ class Examination:
         model = None if self.quick else self.baseline.residual
         if model is None:
             return np.full(3, np.nan)
-        ratios = model.ratios_of(self.pipeline, self.recording)
-        fit = self.deviation_of_rows(slice(None)) if np.isfinite(ratios).any() else None
-        return np.append(ratios, np.nan if fit is None else mean_t2(*fit) / model.fit_limit)
+        ratios, fit = model.ratios_of(self.pipeline, self.recording), self.whole_fit
+        judged = fit is not None and np.isfinite(ratios).any()
+        return np.append(ratios, mean_t2(*fit) / model.fit_limit if judged and fit is not None else np.nan)
+
+    @cached_property
+    def whole_fit(self) -> tuple[FloatArray, FloatArray] | None:
+        """`deviation_of_rows` of the whole recording; None where it is `quick`, too."""
+        return None if self.quick else self.deviation_of_rows(slice(None))
 
     def deviation_of_rows(self, rows: slice) -> tuple[FloatArray, FloatArray] | None:
         """Return theta of some rows minus its healthy expectation, (n,), and how such fits scatter, (n, n).

@@ -69,7 +69,7 @@ FAULTS: dict[str, tuple[str, tuple[float, float], str, str]] = {
     ),
     "leakage": (
         "leakage",
-        (0.05, 20.0),
+        (0.05, 50.0),
         "more u to hold a load: leakage of piston or valve",
         "piston seal and valve edges: warm cylinder, drift under load with the valve shut, oil return flow",
     ),
@@ -123,7 +123,8 @@ class CylinderPlant(TermPlant):
     ray_angles: ClassVar[Mapping[str, float]] = {
         **dict.fromkeys(FAULTS, 0.1),
         **dict.fromkeys(("supply_pressure", "load", "offset"), 0.05),
-        **dict.fromkeys(("overlap", "process"), 0.2),
+        "overlap": 0.25,
+        "process": 0.3,
     }
     size_errors: ClassVar[Mapping[str, float]] = {"supply_pressure": 0.1}  # as `LOAD_SHARE` may be 0 to 0.3
     fits_stretches: ClassVar[bool] = True
@@ -196,11 +197,9 @@ class CylinderPlant(TermPlant):
 
     @property
     def faults(self) -> tuple[Fault, ...]:
-        """Changes that are told by name, as far as the terms show them."""
+        """Changes by name; of some no term shows anything, which `learn` says."""
         return tuple(
-            Fault(name, parameter, range_, words, checks)
-            for parameter, (name, range_, words, checks) in FAULTS.items()
-            if parameter in EXPONENTS or parameter in self.names or self.pressures is not None
+            Fault(name, parameter, range_, words, checks) for parameter, (name, range_, words, checks) in FAULTS.items()
         )
 
     def exponents(self, parameter: str, healthy: Mapping[str, float] | None = None) -> Mapping[str, float]:
