@@ -51,10 +51,10 @@ figures: $(STAMP)  ## run the programs behind the figures of the documents, and 
 pictures: $(STAMP)  ## the pictures of README and docs, with the record of what they show (half an hour)
 	$(BIN)/servoscope demo -o demo-output
 	$(BIN)/python scripts/screenshot.py demo-output/report.html docs/images/report.png
-	$(BIN)/python benchmarks/steps.py demo-output -o docs/images/steps
-	$(BIN)/python benchmarks/public/overview.py --picture docs/images/benchmarks.svg
-	$(BIN)/python benchmarks/accuracy/run.py --render
-	$(BIN)/python benchmarks/accuracy/nonlinear.py --figure docs/images/nonlinear-rig.png
+	$(BIN)/python benchmarks studies/steps demo-output -o docs/images/steps
+	$(BIN)/python benchmarks public/overview --picture docs/images/benchmarks.svg
+	$(BIN)/python benchmarks accuracy/run --render
+	$(BIN)/python benchmarks accuracy/nonlinear --figure docs/images/nonlinear-rig.png
 	$(BIN)/servoscope reproduce --seeds 20 -o build/paper && cp build/paper/*.png docs/images/paper
 	$(BIN)/python scripts/pictures.py --record
 	SCREENSHOTS=docs/images/pages $(BIN)/python -m pytest -n 0 tests/web/test_web_pages.py tests/web/test_web_action.py tests/web/test_web_files.py

@@ -1,6 +1,6 @@
 """Payloads, friction, belt and backlash of an arm joint, beside simple detectors; simulated apart from the package.
 
-    python benchmarks/accuracy/arm.py [--count N] [--json]
+    python benchmarks accuracy/arm [--count N] [--json]
 
 A motor turns an arm through a belt: the encoder sits on the motor, and the plant of the loop file knows no belt. The
 arm hangs, its joint has viscous and Coulomb friction, and friction in proportion to the force in the belt. A payload m
@@ -14,9 +14,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numba
 import numpy as np
@@ -255,7 +252,3 @@ def _weights(named: list[ss.Diagnosis], true: float) -> tuple[str, str, str]:
     errors = np.abs(np.array([mass[0] for mass in known]) / true - 1.0)
     inside = sum(low <= true <= high for _, low, high in known)
     return f"{100 * np.median(errors):.1f} %", f"{100 * errors.max():.1f} %", f"{inside} of {len(known)}"
-
-
-if __name__ == "__main__":
-    main()

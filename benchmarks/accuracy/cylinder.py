@@ -1,6 +1,6 @@
 """Faults of a hydraulic cylinder, found and named, beside simple detectors.
 
-    python benchmarks/accuracy/cylinder.py [--mixed] [--first SEED] [--json]
+    python benchmarks accuracy/cylinder [--mixed] [--first SEED] [--json]
 
 Seven healthy production days are learned, or ten of mixed motions; 32 further healthy days, sixty faults and six
 changes of the process force are judged. Days, faults and sizes: `cylinder_days.py`.
@@ -10,9 +10,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from public.simple_detectors import detectors, judge
 from tables import Table, parser, show
@@ -135,7 +132,3 @@ def main() -> None:
         values[f"{one.name}.found"] = f"{sum(hit[k] for k in faults)}"
         values[f"{one.name}.false"] = f"{sum(x for x, day in zip(hit, days, strict=True) if not day.fault)}"
     show(tables, given.json, values)
-
-
-if __name__ == "__main__":
-    main()

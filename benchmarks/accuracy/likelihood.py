@@ -1,14 +1,9 @@
 """Coefficients of polynomial plants under noise in y: the instrument against the likelihood; prints a Markdown table.
 
-python benchmarks/accuracy/likelihood.py [--json]
+python benchmarks accuracy/likelihood [--json]
 """
 
 from __future__ import annotations
-
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # where `accuracy` is a package
 
 import numpy as np
 from tables import Table, parser, show
@@ -69,7 +64,3 @@ def main() -> None:
     )
     columns = ("loop", "motion", "noise", "least squares", "instrument", "likelihood")
     show([Table("Instrument and likelihood", note, columns, tuple(rows))], given.json)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """The nonlinear rig: where the linear inverse ends, and what the square-root valve law is worth; prints Markdown.
 
-    python benchmarks/accuracy/nonlinear.py [--quick] [--json] [--figure FILE.png]
+    python benchmarks accuracy/nonlinear [--quick] [--json] [--figure FILE.png]
 
 Every simulation has its own seed.
 The loop file knows the rig's delay of 12.8 ms (one sample and the valve) unless a row says otherwise. About eight
@@ -10,7 +10,6 @@ minutes on one core.
 from __future__ import annotations
 
 import functools
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
@@ -19,9 +18,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from tables import Table, parser, show
 
 import servoscope as ss
@@ -406,7 +402,3 @@ def main() -> None:
     else:
         made = [table for part in (effects, methods, names, pressure, over_amplitude) for table in part()]
         show(made, given.json, values(made))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """From logs to a size by `init` alone: a slide and a joint, whose friction grows; simulated apart from the package.
 
-    python benchmarks/accuracy/proposals.py [--count N] [--json]
+    python benchmarks accuracy/proposals [--count N] [--json]
 
 Three healthy logs are written as CSV; `init` makes the loop, nothing is edited, `learn` and `diagnose` follow. The
 slide of `axis.py` has Coulomb friction that grows to 1.1 to 2 times its value within each log; that of the joint of
@@ -9,13 +9,10 @@ slide of `axis.py` has Coulomb friction that grows to 1.1 to 2 times its value w
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
 from tables import Table, parser, show
@@ -96,7 +93,3 @@ def main() -> None:
     note = f"60 s at {axis.RATE:g} Hz each, {LEARNED} healthy logs. Coulomb friction x {RATIOS[0]:g} to {RATIOS[1]:g}"
     note += f" on the slide, x {JOINT_RATIO:g} on the joint."
     show([Table("Logs to sizes by `init`", note, heads, tuple(rows))], given.json, values)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Run scenarios of accuracy in parallel, keep their results as JSON, and render them into RESULTS.md beside it.
 
-    python benchmarks/accuracy/run.py [ID ...] [--list] [--workers N] [--share 0.1] [--render]
+    python benchmarks accuracy/run [ID ...] [--list] [--workers N] [--share 0.1] [--render]
 
 Without an ID all of them run; an ID may be the beginning of several, as "bias/" or "coverage". --render writes the
 tables and figures from the results that are there; together with IDs or --share, after running them.
@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 BENCHMARKS = Path(__file__).resolve().parent.parent
-sys.path[0] = str(BENCHMARKS)  # where `accuracy` is a package, and `tables` lies
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # one thread per worker
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn  # noqa: E402
@@ -172,7 +171,3 @@ def main() -> None:
         run(chosen, given.share or 1.0, given.workers)
     if given.render:
         render()
-
-
-if __name__ == "__main__":
-    main()

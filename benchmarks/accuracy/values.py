@@ -1,19 +1,15 @@
 """Prints the figures of docs/accuracy.md and of sentences in other documents from stored results; measures nothing.
 
-python benchmarks/accuracy/values.py [--json]
+python benchmarks accuracy/values [--json]
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
-sys.path[0] = str(Path(__file__).resolve().parent.parent)  # where `accuracy` is a package, and `tables` lies
+from tables import parser, show
 
-from tables import parser, show  # noqa: E402
-
-from accuracy import run  # noqa: E402
+from accuracy import run
 
 
 def rows_of(key: str) -> Iterator[tuple[str, ...]]:
@@ -94,5 +90,6 @@ def values() -> dict[str, str]:
     return found | {"delay.leakage": leak[4], "delay.leakage-best": leak[6]}
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Print the values."""
     show([], parser(__doc__).parse_args().json, values())

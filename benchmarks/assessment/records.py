@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import loops
 import numpy as np
 import numpy.typing as npt
 
+from assessment import loops
 from servoscope.assessment.assess import MIN_ROWS, equidistant
 from servoscope.assessment.causes import CAUSES
 from servoscope.assessment.features import analyse

@@ -1,6 +1,6 @@
 """How often `servoscope assess` is right: simulated loops of another family, process loops, healthy servo recordings.
 
-    python benchmarks/assessment/score.py [--data ../shared/data] [--number 1000]
+    python benchmarks assessment/score [--data ../shared/data] [--number 1000]
 
 Process loops are judged by posteriors that were fitted without them, one loop left out at a time, and servo recordings
 without those of their folder. Textbook indices are judged on the same records.
@@ -9,22 +9,18 @@ without those of their folder. Textbook indices are judged on the same records.
 from __future__ import annotations
 
 import itertools
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from records import Records, measured, servos, simulated
-from train import SEED, SIMULATED, fit
+from assessment.records import Records, measured, servos, simulated
+from assessment.train import SEED, SIMULATED, fit
+from tables import Table, parse_with_data, parser, show
 
 from servoscope.assessment.assess import MIN_PROBABILITY
 from servoscope.assessment.causes import CAUSES, MIN_SURE_PROBABILITY, POOR_CONTROL
 from servoscope.assessment.features import analyse
 from servoscope.assessment.posterior import load_posterior
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from tables import Table, parse_with_data, parser, show
 
 TEST_SEED = 0
 BINS = (0.5, 0.7, 0.9, 1.0001)
@@ -182,7 +178,3 @@ def main() -> None:
         index_table(test, real),
     )
     show(tables, given.json, {"10 000 rows": f"{seconds(10_000):.1f}", "200 000 rows": f"{seconds(200_000):.1f}"})
-
-
-if __name__ == "__main__":
-    main()

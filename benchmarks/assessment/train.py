@@ -1,25 +1,22 @@
 """Fit the posterior of `servoscope assess` to simulated loops of the training family and to process loops.
 
-python benchmarks/assessment/train.py [--data ../shared/data]
+python benchmarks assessment/train [--data ../shared/data]
 """
 
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from records import Records, measured, servos, simulated
+from assessment.records import Records, measured, servos, simulated
 from scipy import optimize, special
+from tables import parse_with_data, parser
 
 from servoscope.assessment import posterior
 from servoscope.assessment.posterior import CausePosterior, StictionDiscriminant, expand_features
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from tables import parse_with_data, parser
 
 SIMULATED, SEED = 1200, 2
 LOOP_WEIGHT = 8.0  # what one measured loop counts, in simulated ones; its logs share it
@@ -112,7 +109,3 @@ def main() -> None:
     real, servo = measured(given.data / "real" / "process_loops"), servos(given.data / "real")
     target = Path(posterior.__file__).with_name("posterior.json")
     target.write_text(to_json(fit(simulated(SIMULATED, SEED, "training"), real, servo)), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

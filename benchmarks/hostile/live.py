@@ -1,6 +1,6 @@
 """Slowest answer of /health/live, and memory, of a real service while it is sent messages that are made to cost much.
 
-    python benchmarks/hostile/live.py [--fuzzed 300]
+    python benchmarks hostile/live [--fuzzed 300]
 
 Sends over mosquitto what hung, slowed down or filled a service once, then fuzzed messages of up to 1 MiB of all three
 encodings, and asks for health meanwhile. Fails if an answer takes a second or longer, or none comes.
@@ -24,8 +24,6 @@ from http.client import HTTPException
 from pathlib import Path
 
 BENCHMARKS = Path(__file__).resolve().parent.parent
-sys.path[0] = str(BENCHMARKS)  # where `hostile` is a package, and `tables` lies
-sys.path.insert(1, str(BENCHMARKS.parent / "tests" / "support"))  # where `reliability` is one
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from reliability.servers import Mosquitto, mosquitto  # noqa: E402
@@ -184,7 +182,3 @@ def main() -> None:
     print(machine())
     if slow := [kind for kind, (seconds, _) in found.items() if seconds >= MAX_ANSWER_S]:
         sys.exit(f"a second or longer: {', '.join(slow)}")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Feed every reader and decoder with broken input, and count what came of it.
 
-    python benchmarks/hostile/run.py [--inputs 900] [--only NAME] [--render]
+    python benchmarks hostile/run [--inputs 900] [--only NAME] [--render]
 
 --render writes the table into benchmarks/reliability/RESULTS.md from the results that are there.
 """
@@ -15,7 +15,6 @@ import sys
 from pathlib import Path
 
 BENCHMARKS = Path(__file__).resolve().parent.parent
-sys.path[0] = str(BENCHMARKS)  # where `hostile` is a package, and `tables` lies
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from tables import machine  # noqa: E402
@@ -55,7 +54,3 @@ def main() -> None:
     print(markdown(found))
     if broken := broken_bounds(found["targets"]):
         sys.exit(f"not read or refused in bounds: {', '.join(broken)}")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Measured axes: changes of random size, kind and time added to u, and what servoscope and simple detectors say.
 
-    python benchmarks/public/axis_injections.py [--data DIR] [--count N] [--seed S] [--machine NAME] [--json]
+    python benchmarks public/axis_injections [--data DIR] [--count N] [--seed S] [--machine NAME] [--json]
 
 Each machine is learned as a plant of kind ``axis``; `count` changes go into each of its cases, 5 to 50 % either way,
 the sizes even in their logarithms, between a quarter and three quarters of the recording.
@@ -18,12 +18,9 @@ the sizes even in their logarithms, between a quarter and three quarters of the 
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
 from tables import Table, parse_with_data, parser, show
@@ -316,7 +313,3 @@ def main() -> None:
         ),
     ]
     show(tables, given.json, values)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Cranfield ball screw with seeded faults: servoscope beside three simple detectors, in the same run.
 
-    python benchmarks/public/cranfield.py [--data DIR] [--load 40] [--draws 20] [--json]
+    python benchmarks public/cranfield [--data DIR] [--load 40] [--draws 20] [--json]
 
 Per load, each detector learns from healthy runs 1 to 5, or from the odd ones, and judges the other five healthy runs
 and all runs of all faults. Its limit comes from the healthy runs that it learned from. False: healthy runs above the
@@ -10,11 +10,8 @@ limit. Found: faulty runs above it. Rank: faulty runs above the worst healthy on
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
 from tables import Table, parse_with_data, parser, show
@@ -158,7 +155,3 @@ def main() -> None:
         table, drawn = draws_table(given.data, loop, loads, given.draws)
         tables, values = [*tables, table], values | drawn
     show(tables, given.json, values)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,17 +1,12 @@
 """Pump-controlled hydraulic cylinder: servoscope beside three simple detectors.
 
-    python benchmarks/public/eha_pump.py [--data DIR] [--json]
+    python benchmarks public/eha_pump [--data DIR] [--json]
 
 Learned from one healthy recording (load 1), the other recording of that load is healthy, those of loads 3 and 5 differ;
 then the other way round. Of the healthy one, u times 1.1 is judged, too: a pump that has lost a tenth.
 """
 
 from __future__ import annotations
-
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from tables import Table, parse_with_data, parser, show
 
@@ -58,7 +53,3 @@ def main() -> None:
         for name, count in counts.items()
     }
     show(tables, given.json, values)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """EMPS, a measured positioning axis: the official score of the nonlinear benchmark, and servoscope as a detector.
 
-    python benchmarks/public/emps.py [--data DIR] [--json]
+    python benchmarks public/emps [--data DIR] [--json]
 
 Official protocol (nonlinearbenchmark.org): identify on DATA_EMPS, simulate the position of DATA_EMPS_PULSES in open
 loop from `vir`, root mean square error in mm from sample 20 on. What it leaves open, and what is done here: the
@@ -15,12 +15,8 @@ recording with pulses judged, which is healthy under another motion.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
 from tables import Table, parse_with_data, parser, show
@@ -217,7 +213,3 @@ def main() -> None:
     directions, score = by_direction(train, test, loop)
     table, found = detection(train, test, loop)
     show([*tables, directions, table], given.json, values | score | found)
-
-
-if __name__ == "__main__":
-    main()

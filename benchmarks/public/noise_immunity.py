@@ -1,6 +1,6 @@
 """Noise immunity at equal speed: estimators of servoscope beside those of other libraries, on the paper's conditions.
 
-    python benchmarks/public/noise_immunity.py [--seeds 3] [--json]
+    python benchmarks public/noise_immunity [--seeds 3] [--json]
 
 Conditions: the reference rig at 100 Hz with the paper's noise; the bilinear regression after a stage 1 by the AKF,
 the same regressors for everybody. Each estimator runs with memories N from 1 to 12 s; its rise time is that of the
@@ -18,12 +18,8 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
-import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import NamedTuple
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
 from tables import Table, parser, show
@@ -230,7 +226,3 @@ def main() -> None:
     )
     heads = ("reference", "library", "estimator", "rise times", "CV of theta", "CV of H at 1 Hz")
     show([Table("Noise immunity", note, heads, tuple(rows))], given.json)
-
-
-if __name__ == "__main__":
-    main()

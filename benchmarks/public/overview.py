@@ -1,6 +1,6 @@
 """All benchmarks beside each other, from the stored results: a table and a picture; measures nothing.
 
-    python benchmarks/public/overview.py [--json] [--picture FILE]
+    python benchmarks public/overview [--json] [--picture FILE]
 
 Run after the benchmarks: it reads `benchmarks/figures/`. The picture is docs/images/benchmarks.svg.
 """
@@ -9,13 +9,10 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from collections.abc import Iterator
 from html import escape
 from pathlib import Path
 from typing import NamedTuple
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from tables import Table, parser, show
 
@@ -115,7 +112,3 @@ def main() -> None:
         rows.append((one.name, *(f"{a} of {b}; {c} of {d}" for (a, b), (c, d) in both)))
     note = "Changes or faults found; false alarms on healthy recordings that were held out."
     show([Table("Overview", note, ("benchmark", *DETECTORS), tuple(rows))], given.json)
-
-
-if __name__ == "__main__":
-    main()

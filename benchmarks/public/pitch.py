@@ -1,6 +1,6 @@
 """Pitch actuators of a wind turbine: five faults after the benchmark of Odgaard, Stoustrup and Kinnaert (2013).
 
-    python benchmarks/public/pitch.py [--hours 100] [--winds 50] [--json]
+    python benchmarks public/pitch [--hours 100] [--winds 50] [--json]
 
 `pitch_turbine.py` is the simulator. A baseline of blade 1 is learned from five healthy winds of ten minutes. Then, per
 wind and fault, ten minutes with the fault from five minutes on.
@@ -13,12 +13,8 @@ benchmark. The cutoff was chosen on winds that are not judged here; what others 
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
 from tables import Table, parser, show
@@ -203,7 +199,3 @@ def main() -> None:
     for fault, found, delay, named, *_ in tables[0].rows:
         values |= {f"{fault}.found": found, f"{fault}.delay": delay, f"{fault}.named": named}
     show(tables, given.json, values)
-
-
-if __name__ == "__main__":
-    main()

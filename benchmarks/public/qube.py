@@ -1,6 +1,6 @@
 """QUBE rotary pendulum, fourteen healthy runs: servoscope beside three simple detectors, leaving one run out.
 
-    python benchmarks/public/qube.py [--data DIR] [--json]
+    python benchmarks public/qube [--data DIR] [--json]
 
 Each run is judged with what was learned from the thirteen others: as measured, and with u times 1.1 (a motor, magnet or
 amplifier that has lost a tenth). servoscope with `model_error = 0` and with that of examples/qube.toml.
@@ -8,10 +8,7 @@ amplifier that has lost a tenth). servoscope with `model_error = 0` and with tha
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from tables import Table, parse_with_data, parser, show
 
@@ -60,7 +57,3 @@ def main() -> None:
         for what, cell in zip(("false", "found"), cells[:2], strict=True)
     }
     show([Table("QUBE: detectors", note, COLUMNS, rows)], given.json, values)
-
-
-if __name__ == "__main__":
-    main()

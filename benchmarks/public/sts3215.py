@@ -1,6 +1,6 @@
 """STS3215, a hobby servo with a pendulum: payloads weighed by runs of six seconds, at one gain and across gains.
 
-    python benchmarks/public/sts3215.py [--data DIR] [--count N] [--json]
+    python benchmarks public/sts3215 [--data DIR] [--count N] [--json]
 
 The mass of the healthy runs stands in the loop file (`payload_mass`). Ten runs with it are learned; others with it, and
 runs with another mass on the same arm, are judged. u is the controller's P law before its limit.
@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
 from tables import Table, parse_with_data, parser, show
@@ -83,7 +81,3 @@ def main() -> None:
     heads = ("arm", "gains", "learned", "false", "found", "weighed", "median payload", "truth in 95 % interval")
     note = f"Runs of 6 s at 100 Hz, motions {' and '.join(MOTIONS)}; `payload_mass` stands in the loop file."
     show([Table("STS3215: payloads of a hobby servo", note, heads, tuple(rows))], given.json)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """XL330, a hobby servo with a pendulum: eight raw files under one baseline, each judged by what the others taught.
 
-    python benchmarks/public/xl330.py [--data DIR] [--json]
+    python benchmarks public/xl330 [--data DIR] [--json]
 
 The loop file is what `init` writes. In four of the files the motor is switched off after 2 s, and the
 pendulum swings freely. Changed recordings have `GAIN` times the u from `CHANGED_S` on: a motor that has become weaker
@@ -9,10 +9,7 @@ under a controller that has become as much stronger.
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from tables import Table, parse_with_data, parser, show
 
@@ -105,7 +102,3 @@ def main() -> None:
 def _gravity_over_inertia(loop: ss.Loop, runs: list[ss.Recording]) -> float:
     model, _ = fit_axis(loop, runs)
     return float("nan") if model is None else model.coefficients["gravity"] / model.coefficients["inertia"]
-
-
-if __name__ == "__main__":
-    main()

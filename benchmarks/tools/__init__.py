@@ -1,1 +1,1 @@
-"""What several cases of `speed.py` use: limits of the machine, other libraries, slow doubles, senders."""
+"""What several cases of the folder `speed` use: limits of the machine, other libraries, slow doubles, senders."""

@@ -1,6 +1,6 @@
 """Whether health and pages are answered while a crowd reads events, and while slow clients hold half-sent headers.
 
-    python benchmarks/web/crowd.py [--readers 1000] [--slow 1500] [--seconds 30] [--assets 50] [--json]
+    python benchmarks web/crowd [--readers 1000] [--slow 1500] [--seconds 30] [--assets 50] [--json]
 
 A process writes the status of every asset twice a second; `servoscope serve` has a login and the setting
 `connections_per_address` as it is by default. The readers log in once and come from as many addresses of the loopback
@@ -21,15 +21,12 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
-BENCHMARKS = Path(__file__).resolve().parent.parent
-sys.path[0] = str(BENCHMARKS)  # where `web` is a package, and `tables` lies
+import httpx
+import numpy as np
+from tables import Table, parser, show
 
-import httpx  # noqa: E402
-import numpy as np  # noqa: E402
-from tables import Table, parser, show  # noqa: E402
-
-from web import store  # noqa: E402
-from web.load import RATE, SOURCE, usage  # noqa: E402
+from web import store
+from web.load import RATE, SOURCE, usage
 
 PER_ADDRESS = 80
 PASSWORD = "correct horse battery"
@@ -196,7 +193,3 @@ def main() -> None:
     measured = measure(given.readers, given.slow, given.seconds, given.assets)
     rows = [(name, f"{value:.3g}" if isinstance(value, float) else str(value)) for name, value in measured.items()]
     show([Table("Crowd", "", ("measured", "value"), tuple(rows))], given.json)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """How long pages of 50 assets with a year of sizes take: each answer of the server, and a browser to its first chart.
 
-    python benchmarks/web/first_chart.py [--assets 50] [--looks 10] [--json]
+    python benchmarks web/first_chart [--assets 50] [--looks 10] [--json]
 
 The store is that of years.py. All that the page of an asset asks for is asked for once for each asset, and the fleet
 and the alarms as often; then a browser opens the pages of some of the assets, each with an empty cache. A chart is
@@ -12,22 +12,18 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
 import tempfile
 import time
 from contextlib import ExitStack
 from pathlib import Path
 
-BENCHMARKS = Path(__file__).resolve().parent.parent
-sys.path[0] = str(BENCHMARKS)  # where `web` is a package, and `tables` lies
+import httpx
+import numpy as np
+from playwright.sync_api import sync_playwright
+from tables import Table, parser, show
 
-import httpx  # noqa: E402
-import numpy as np  # noqa: E402
-from playwright.sync_api import sync_playwright  # noqa: E402
-from tables import Table, parser, show  # noqa: E402
-
-from web.load import usage  # noqa: E402
-from web.years import PAGE, fill, serve  # noqa: E402
+from web.load import usage
+from web.years import PAGE, fill, serve
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 DRAWN = """() => [...document.querySelectorAll("canvas")].some((c) => c.width && c.height
@@ -97,7 +93,3 @@ def main() -> None:
         f"{os.getloadavg()[0]:.1f}. Median, 95 % and largest."
     )
     show([Table("Pages of a year", note, ("what", "value"), rows)], given.json)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """How far behind pages are with 500 assets at 2 Hz and 20 of them open, and what that costs the server.
 
-    python benchmarks/web/load.py [--seconds 60] [--assets 500] [--pages 20]
+    python benchmarks web/load [--seconds 60] [--assets 500] [--pages 20]
 
 A process writes a commit with the status of every asset twice a second into a SQLite store; `servoscope serve` runs on
 one core; 20 readers of its events, in a process of their own, take the time from the moment that a status was stored
@@ -189,7 +189,3 @@ def main() -> None:
     said = parser.parse_args()
     for name, value in measure(said.seconds, said.assets, said.pages).items():
         print(f"{name:36}{value:10.4g}")
-
-
-if __name__ == "__main__":
-    main()

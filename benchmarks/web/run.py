@@ -1,6 +1,6 @@
 """Let many pages look at many assets, and write the table of benchmarks/STUDIES.md.
 
-    python benchmarks/web/run.py [--assets 500] [--pages 4] [--readers 16] [--seconds 60] [--hour 3600] [--render]
+    python benchmarks web/run [--assets 500] [--pages 4] [--readers 16] [--seconds 60] [--hour 3600] [--render]
 
 The server has one core to itself; pages in a real browser, readers of the same events without one, and what moves the
 assets share the others. Reduced runs are marked as such. --render writes the table from the results that are there;
@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Any
 
 BENCHMARKS = Path(__file__).resolve().parent.parent
-sys.path[0] = str(BENCHMARKS)  # where `web` is a package, and `tables` lies
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from playwright.sync_api import Browser, Page, sync_playwright  # noqa: E402
@@ -153,7 +152,7 @@ def moving(folder: Path, assets: int, rate: float, seconds: float) -> Iterator[N
     """Let the statuses of assets move in a new store."""
     for path in folder.glob(f"{store.FILE}*"):
         path.unlink()
-    command = [sys.executable, store.__file__, str(folder), str(assets), str(rate), str(seconds)]
+    command = [sys.executable, str(BENCHMARKS / "web"), "store", str(folder), str(assets), str(rate), str(seconds)]
     with child(command, cores=others()):
         while not (folder / store.FILE).exists():
             time.sleep(0.1)
@@ -280,7 +279,3 @@ def main() -> None:
         print(json.dumps(found, indent=1))
     if given.render:
         render()
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """A store that looks as if hundreds of assets were followed: the statuses of real ones, copied, moving twice a second.
 
-    python benchmarks/web/store.py FOLDER ASSETS RATE SECONDS
+    python benchmarks web/store FOLDER ASSETS RATE SECONDS
 
 writes on, `RATE` times a second, for so many seconds. What is measured is pages and interface; the samples behind the
 statuses were followed once, before.
@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 BENCHMARKS = Path(__file__).resolve().parent.parent
-sys.path[0] = str(BENCHMARKS)
 
 from servoscope.learning.learn import nominal_baseline  # noqa: E402
 from servoscope.models.loop import Loop  # noqa: E402
@@ -86,5 +85,7 @@ def move(folder: Path, assets: int, rate: float, seconds: float) -> None:
     store.close()
 
 
-if __name__ == "__main__":
-    move(Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]), float(sys.argv[4]))
+def main() -> None:
+    """Move the statuses of a store: folder, assets, rate [1/s], seconds."""
+    folder, assets, rate, seconds = sys.argv[1:]
+    move(Path(folder), int(assets), float(rate), float(seconds))

@@ -1,6 +1,6 @@
 """How fast the pages of an asset are with a year of its sizes in the store, and how large that store is.
 
-    python benchmarks/web/years.py [--assets 50] [--keep FOLDER] [--json]
+    python benchmarks web/years [--assets 50] [--keep FOLDER] [--json]
 
 A leak that grows and the four coefficients of the reference rig, one value every ten minutes for a year, are written
 for one asset and thinned as the service does; the other assets get the same rows. Times are of `servoscope serve`, the
@@ -22,19 +22,16 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-BENCHMARKS = Path(__file__).resolve().parent.parent
-sys.path[0] = str(BENCHMARKS)  # where `web` is a package, and `tables` lies
+import httpx
+import numpy as np
+import sqlalchemy as sa
+from tables import Table, parser, show
 
-import httpx  # noqa: E402
-import numpy as np  # noqa: E402
-import sqlalchemy as sa  # noqa: E402
-from tables import Table, parser, show  # noqa: E402
-
-from servoscope.service.store import Batch, Store, tables  # noqa: E402
-from servoscope.service.store.rows import SIZE_EVERY_S, coefficient_rows, fault_rows  # noqa: E402
-from servoscope.service.store.series import thin_sizes  # noqa: E402
-from web import store  # noqa: E402
-from web.load import SOURCE, usage  # noqa: E402
+from servoscope.service.store import Batch, Store, tables
+from servoscope.service.store.rows import SIZE_EVERY_S, coefficient_rows, fault_rows
+from servoscope.service.store.series import thin_sizes
+from web import store
+from web.load import SOURCE, usage
 
 REPEATS = 9
 YEAR_S = 365 * 86400.0
@@ -149,7 +146,3 @@ def main() -> None:
         "Of answers: as a reader waits, and processor time of the server."
     )
     show([Table("A year of sizes", note, ("what", "value"), rows)], given.json)
-
-
-if __name__ == "__main__":
-    main()

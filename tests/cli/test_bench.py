@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 
 import pytest
-from cases import chain
 from commands import run
+from speed import chain
 from tools.timing import JobTiming, time_interleaved
 
 FIGURES = (

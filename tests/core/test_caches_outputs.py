@@ -8,13 +8,14 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 from commands import one_line, run
 
 from servoscope.core.cache_folders import warn_of_missing_cache
 from servoscope.core.files import atomic_write, exclusive_folder
-from servoscope.core.jit.loops import kernel
+from servoscope.core.jit.array_function import ArrayFunction
 
 NOWHERE = "/proc/nowhere"  # not even the administrator can make it
 NO_CACHES = {
@@ -22,15 +23,15 @@ NO_CACHES = {
     "XDG_CACHE_HOME": f"{NOWHERE}/c",
     "XDG_CONFIG_HOME": f"{NOWHERE}/d",
     "NUMBA_CACHE_DIR": f"{NOWHERE}/n",
-    "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator",  # else a folder beside the source would do
 }
 NO_INSTALL = {"PYTHONDONTWRITEBYTECODE": "1"}
 BOTH_LIBRARIES = """
 from servoscope.core.cache_folders import replace_library_warnings
 replace_library_warnings()
 import matplotlib.figure
-from servoscope.core.jit.loops import kernel
-kernel(lambda x: x)
+import numpy
+from servoscope.models.lfilter import lfilter
+lfilter(numpy.ones(2), numpy.ones(1), numpy.ones(3))
 """
 
 
@@ -60,11 +61,11 @@ def test_every_step_of_the_demonstration_works_without_home_and_caches(tmp_path:
 def test_a_cache_that_can_no_longer_be_written_is_done_without(monkeypatch: pytest.MonkeyPatch) -> None:
     warn_of_missing_cache.cache_clear()
 
-    @kernel
-    def twice(x: float) -> float:
-        return 2.0 * x
+    @ArrayFunction
+    def twice(printer: Any, x: Any) -> Any:
+        return x * 2.0
 
-    monkeypatch.setattr(twice._cache, "_cache_path", NOWHERE)  # type: ignore[attr-defined]
+    monkeypatch.setenv("NUMBA_CACHE_DIR", NOWHERE)
     assert twice(1.5) == 3.0
 
 

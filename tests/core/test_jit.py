@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from servoscope.core.cache_folders import warn_of_missing_cache
-from servoscope.core.jit import maximum, native, where
+from servoscope.core.jit import Int, maximum, native, where
 from servoscope.core.jit.array_function import ArrayFunction
 from servoscope.core.jit.arrays import Variable, add_terms
 from servoscope.core.jit.llvm_text import LlvmPrinter
@@ -158,7 +158,7 @@ def follow_range(printer: Any, states: Any, x: Any, flags: Any, numbers: Any) ->
             s.ends[0], s.ends[1] = where(x[k] < s.ends[0], x[k], s.ends[0]), maximum(s.ends[1], x[k])
         run.value = where(flags[k] > 0, run.value + 1, 0)
         longest.value = maximum(longest.value, run.value)
-        flags[k] = where(numbers[k].is_equal(3) | ~(flags[k] > 0), 1, printer.whole(0))
+        flags[k] = where(numbers[k].is_equal(3) | ~(flags[k] > 0), 1, Int(printer, "0"))
     return add_terms(printer, printer.number(longest.value), x.shape[0], lambda k: x[k])
 
 

@@ -12,9 +12,9 @@ import pytest
 from drives import compiler
 from hypothesis import given
 from hypothesis import strategies as st
+from studies import export as benchmark
 from test_export import demo
 
-import export as benchmark
 from servoscope.core.jit.c_source import c_literal
 from servoscope.export import export_c
 

@@ -246,7 +246,7 @@ class TestFiles:
 class TestCranfield:
     @pytest.mark.slow
     def test_names_are_right_or_left_open(self, shared_data: Path) -> None:
-        """Half of the runs after learning from the other; `benchmarks/labelled.py` does it both ways, at all loads."""
+        """Half of the runs after learning from the other; the whole study does both, at all loads."""
         folder, loop = shared_data / "real" / "cranfield", ss.Loop.load(PROJECT / "examples" / "cranfield.toml")
 
         def runs(file: str, load: str, which: str) -> list[ss.Recording]:

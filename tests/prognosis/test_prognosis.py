@@ -21,7 +21,7 @@ from servoscope.prognosis.series import SizeSeries, read_sizes
 from servoscope.prognosis.wear import Courses, WearPosterior, filter_series, fit_wear, scale_series
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-import prognosis as study
+from studies import prognosis as study
 
 LIMIT = 1.5
 
@@ -202,7 +202,7 @@ class TestCommand:
 
 @pytest.mark.slow
 def test_intervals_hold_on_the_courses_of_the_study() -> None:
-    """A part of benchmarks/prognosis.py: 90 % intervals, and silence where nothing wears."""
+    """A part of benchmarks/studies/prognosis.py: 90 % intervals, and silence where nothing wears."""
     courses = [study.course(seed, study.KINDS[seed % 4], temperature=bool(seed // 4 % 2)) for seed in range(8)]
     given_share, held, _, _ = study.score([each for each in courses if math.isfinite(each.life)], study.ours)
     assert float(given_share) > 95.0 and float(held) > 75.0

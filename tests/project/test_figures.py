@@ -120,7 +120,7 @@ def test_programs_that_count_the_same_agree() -> None:
 
 def test_the_picture_of_the_benchmarks_is_that_of_the_stored_results(tmp_path: Path) -> None:
     drawn = tmp_path / "benchmarks.svg"
-    command = [sys.executable, "benchmarks/public/overview.py", "--picture", str(drawn)]
+    command = [sys.executable, "benchmarks", "public/overview", "--picture", str(drawn)]
     subprocess.run(command, cwd=PROJECT, check=True, capture_output=True)
     assert drawn.read_text(encoding="utf-8") == (PROJECT / "docs" / "images" / "benchmarks.svg").read_text("utf-8")
 

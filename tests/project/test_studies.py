@@ -6,6 +6,9 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,10 +16,10 @@ from typing import Any
 import numpy as np
 import pytest
 from accuracy import nonlinear, run
-from recordings import RIG
+from studies.design import size
+from studies.recordings import RIG
 
 import servoscope as ss
-from design import size
 from servoscope.design.detectability import AlarmPower, detectable_size
 from servoscope.design.mimics import match_mimic, mimic_causes
 from servoscope.design.scenario import Scenario
@@ -53,6 +56,16 @@ def numbers(result: Any) -> Iterator[Any]:
             yield from numbers(part)
     else:
         yield result
+
+
+def test_the_program_of_each_figure_is_listed() -> None:
+    command = [sys.executable, "benchmarks"]
+    listed = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, check=True).stdout
+    programs = {line.split()[0] for line in listed.splitlines()}
+    figures = tomllib.loads((PROJECT / "benchmarks" / "figures.toml").read_text(encoding="utf-8"))
+    words = [figure["command"].split() for figure in figures.values()]
+    assert {name for program, name, *_ in words if program == "benchmarks"} <= programs
+    assert subprocess.run([*command, "public/nothing"], cwd=PROJECT, capture_output=True, check=False).returncode == 1
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)

@@ -11,8 +11,8 @@ from scipy.integrate import solve_ivp
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 
-import two_mass as benchmark
 from public.simple_detectors import FeatureT2, judge
+from studies import two_mass as benchmark
 from tools import two_mass
 
 import servoscope as ss

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.messages import Message, message
+from servoscope.models.lfilter import lfilter
 
 EDGE_SHARE = 0.2  # share of the learned range, by which a covariate may be outside of it, where slopes are less certain
 
@@ -154,8 +155,6 @@ class CovariateAverage:
 
     def run(self, state: FloatArray, c: FloatArray) -> FloatArray:
         """Return the average after each sample, (N, k), NaN before the first value; changes the state."""
-        from servoscope.models.lfilter import lfilter
-
         last, memory = np.split(state, [c.shape[1]])
         held, z = hold_last(c, last), memory.reshape(-1, 2)
         averages = np.full_like(held, np.nan)

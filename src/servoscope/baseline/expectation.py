@@ -19,6 +19,7 @@ import numpy as np
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.errors import LoopError, SimulationError
 from servoscope.estimation.filter_bank import closed_loop_system, nominal_theta
+from servoscope.estimation.moments import mean_path
 from servoscope.estimation.noise_model import (
     ArmaNoise,
     WhiteNoise,
@@ -281,8 +282,6 @@ class MeanPropagator:
 
     def advance(self, reference: ReferencePath) -> FloatArray:
         """Return the mean at the evaluations of the next piece of a reference, shape (K, n)."""
-        from servoscope.estimation.moments import mean_path
-
         g, which = self._undisturbed.advance(reference)
         tuning, number = self._tuning, self._samples
         self._samples += len(which)

@@ -7,6 +7,7 @@ import functools
 import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
+from servoscope.estimation.moments import whiten_each
 
 POWER = 0.9  # probability with which a promised change is seen
 
@@ -45,8 +46,6 @@ def whiten(covariance: FloatArray, deviation: FloatArray) -> FloatArray:
 
     `covariance`: shape (K, n, n); `deviation`: shape (K, n) or (K, n, m).
     """
-    from servoscope.estimation.moments import whiten_each
-
     columns = deviation if deviation.ndim == 3 else deviation[..., None]
     C, d = np.ascontiguousarray(covariance, dtype=np.float64), np.ascontiguousarray(columns, dtype=np.float64)
     white, n = np.empty(d.shape), C.shape[-1]

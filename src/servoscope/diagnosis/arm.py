@@ -268,7 +268,7 @@ def _explain(
     if certain and best.cause.kind == "payload" and baseline.loop.payload == "change":
         return "healthy", message("arm.payload_changed", size=_size(baseline, best), since=since), interval, reasons
     if certain:
-        name = {"kind": best.cause.kind, "joint": _of(best.cause)}
+        name = {"kind": best.cause.kind, "joint": _joint(best.cause.joint)}
         return "fault", message("arm.fault", **name, size=_size(baseline, best), since=since), interval, reasons
     if best.cause.kind == UNKNOWN:
         return "fault", message("arm.unknown", since=since), interval, reasons
@@ -298,10 +298,6 @@ def _pool(evidence: ChangeEvidence, indices: Sequence[int]) -> CauseEvidence:
 
 def _joint(name: str) -> Message | None:
     return message("arm.of_joint", joint=name) if name else None
-
-
-def _of(cause: ArmCause) -> Message | None:
-    return _joint(cause.joint)
 
 
 def _named_kinds(interval: FaultInterval) -> list[str]:

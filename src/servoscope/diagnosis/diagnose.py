@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -56,12 +56,10 @@ from servoscope.evidence.sensors import check_sensors
 from servoscope.evidence.signals import find_signal_defect
 from servoscope.isolation.candidate import UNKNOWN, Candidate
 from servoscope.isolation.isolate import isolate
+from servoscope.isolation.ml import RefitResult, find_outside_onset
 from servoscope.signals import MIN_SAMPLES, Recording
 from servoscope.signals.readers import as_recording
 from servoscope.signals.readers.frames import Source
-
-if TYPE_CHECKING:
-    from servoscope.isolation.ml import RefitResult
 
 MIN_CERTAINTY = 0.95  # probability from which a fault is named
 MAX_SIGNAL = 1e60  # of a signal; products of four of them still are numbers
@@ -311,8 +309,6 @@ def _explain_alarm(
     )
     refined = ml_refit.refit_recording(exam, onset, alarm.sample, last, lambda: progress("refit")) if seen else None
     if refined is not None and not _prefers_learned_fault(refined, recursive[0]):
-        from servoscope.isolation.ml import find_outside_onset
-
         # one change that is no fault comes before several that are
         outside = find_outside_onset(refined) if refined.is_unknown else None
         trace = partial(trace_timeline, exam, refined, alarm.onset, recursive, MIN_CERTAINTY)

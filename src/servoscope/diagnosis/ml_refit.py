@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,11 +14,17 @@ from servoscope.diagnosis.result import VIBRATION, DiagnosisWarning, FaultInterv
 from servoscope.diagnosis.warnings import warning_throughout
 from servoscope.evidence.examination import Examination
 from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
+from servoscope.isolation.ml import (
+    MAX_WINDOW_SAMPLES,
+    Hypothesis,
+    OnsetEstimate,
+    RefitResult,
+    find_other_causes,
+    fit_hypotheses,
+)
+from servoscope.isolation.ml.axis_vibration import AxisVibration
+from servoscope.isolation.ml.search import OUTSIDE_PRIOR
 from servoscope.models.plants import Fault, Plant
-
-if TYPE_CHECKING:  # its kernels are loaded after an alarm, not before
-    from servoscope.isolation.ml import Hypothesis, OnsetEstimate, RefitResult
-    from servoscope.isolation.ml.axis_vibration import AxisVibration
 
 MIN_PAIR_PROBABILITY = 1e-3  # probability from which a pair of faults is listed
 MAX_EQUAL_MISFIT = 6.0  # squared standard deviations by which a pair may fit worse: its likelihood is a twentieth
@@ -33,8 +38,6 @@ def refit_recording(
     exact, axis = exam.baseline.exact, exam.baseline.axis
     if axis is None and (exact is None or exact.misfit > 1.0):
         return None
-    from servoscope.isolation.ml import MAX_WINDOW_SAMPLES, fit_hypotheses
-
     most = MAX_WINDOW_SAMPLES * (1 if axis is None else axis.stride)
     begin = max(onset.sample - most, 0)
     near = exam.recording.rows(slice(begin, onset.sample + most))
@@ -44,8 +47,6 @@ def refit_recording(
 
 def vibration_interval(exam: Examination, vibration: AxisVibration) -> FaultInterval:
     """Return the interval of an axis that swings or rattles: no coefficient changed, so nothing is refitted."""
-    from servoscope.isolation.ml.search import OUTSIDE_PRIOR
-
     t = exam.recording.t
     low, likely, high = (float(t[k]) for k in vibration.onset)
     fault = FaultEstimate(name=VIBRATION, parameter=VIBRATION, ratio=vibration.ratio, interval=vibration.interval)
@@ -107,8 +108,6 @@ def summarise_refit(
 
     `outside`: when a cause outside the list of faults came that explains everything.
     """
-    from servoscope.isolation.ml import find_other_causes
-
     t, window = exam.recording.t, refined.window
     over = refined.onset.profile.duration
     of_y, of_u = exam.baseline.plant.units

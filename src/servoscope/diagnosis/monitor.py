@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -18,9 +18,8 @@ from servoscope.detection.trace import Trace
 from servoscope.diagnosis.monitor_constants import MonitorConstants, compatibility_key, deduplicate
 from servoscope.diagnosis.side_monitors import AssetValues, SideLanes, SideValues
 from servoscope.estimation.frequency_response import FrequencyResponse
-
-if TYPE_CHECKING:
-    from servoscope.estimation.recursion import Recursion
+from servoscope.estimation.kernel.sample_steps import SAMPLE
+from servoscope.estimation.recursion import Recursion, structure_key
 
 
 class Monitor:
@@ -157,14 +156,10 @@ class Monitor:
 
     def phase(self, state: FloatArray) -> npt.NDArray[np.int64]:
         """Return where between two evaluations each asset is, shape (assets,): those of one phase go together."""
-        from servoscope.estimation.kernel.sample_steps import SAMPLE
-
         return self._groups[0][1].phase(np.atleast_2d(state)[:, self._prefix_size + SAMPLE])
 
     def _group_assets(self) -> list[tuple[npt.NDArray[np.intp], Recursion]]:
         """Return the assets of each structure, which go through one recursion together."""
-        from servoscope.estimation.recursion import Recursion, structure_key
-
         keys = {id(constants): structure_key(constants.constants) for constants in self._constants_of}
         members: dict[Hashable, list[int]] = {}
         for i, monitor_constants in enumerate(self._constants_of):
@@ -223,8 +218,6 @@ class Monitor:
         RecordingError
             If the shapes do not fit together, or a covariate is missing.
         """
-        from servoscope.estimation.kernel.sample_steps import SAMPLE
-
         number = np.float32 if self._single_precision else np.float64
         signals = [np.atleast_2d(np.ascontiguousarray(signal, dtype=number)) for signal in (r, u, y)]
         shape = (len(self.baselines), signals[0].shape[1])
@@ -332,8 +325,6 @@ class Monitor:
 
     def latest(self, state: FloatArray) -> Trace:
         """Return the trace of the latest evaluation in a state."""
-        from servoscope.estimation.kernel.sample_steps import SAMPLE
-
         rows = np.atleast_2d(state)[:, self._prefix_size :]
         out = np.empty((len(rows), self._groups[0][1].sizes.row))
         for assets, recursion in self._groups:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,10 +16,8 @@ from servoscope.diagnosis.side_monitors import SideMonitors
 from servoscope.estimation import frequency_response
 from servoscope.estimation.frequency_response import FrequencyResponse
 from servoscope.estimation.pipeline import Pipeline
+from servoscope.estimation.recursion import EvaluationConstants, RecursionConstants
 from servoscope.estimation.two_stage import StageOneRunner
-
-if TYPE_CHECKING:
-    from servoscope.estimation.recursion import RecursionConstants
 
 
 def compatibility_key(baseline: Baseline) -> tuple[Hashable, ...]:
@@ -43,8 +41,6 @@ class MonitorConstants:
     @classmethod
     def from_baseline(cls, baseline: Baseline) -> MonitorConstants:
         """Derive the constants; the bias under the baseline's references is taken out of estimate and expectation."""
-        from servoscope.estimation.recursion import EvaluationConstants
-
         pipeline, stage = baseline.pipeline(), StageOneRunner(baseline.loop, baseline.recursion.stage_one)
         frequencies, expected = baseline.loop.monitor.frequencies, np.array(baseline.theta) - baseline.bias
         E = pipeline.bank.E(frequencies)

@@ -8,6 +8,7 @@ from servoscope.core.errors import ServoscopeError
 from servoscope.core.messages import message
 from servoscope.diagnosis.result import DiagnosisWarning
 from servoscope.evidence.examination import Examination
+from servoscope.learning.learn import learn_baseline
 
 SHARE = 1.0 / 3.0  # of the recording that counts as its past
 BUDGET = 0.1  # of the budget of false alarms, which this second test adds to that of the first
@@ -26,8 +27,6 @@ def examine_by_own_past(exam: Examination) -> Examination | None:
     # where the exact plant explains all healthy recordings, the refit lets its parameters follow each of them anyway
     if len(baseline.sources) < 2 or baseline.exact is None or baseline.exact.misfit <= 1.0:
         return None
-    from servoscope.learning.learn import learn_baseline
-
     end_s = float(recording.t[0]) + SHARE * recording.duration_s
     if (exam.alarm & (exam.t(slice(None)) <= end_s)).any():
         return None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,9 +12,8 @@ from servoscope.diagnosis.ml_refit import refit_candidates, summarise_refit
 from servoscope.diagnosis.result import FaultInterval
 from servoscope.evidence.examination import Examination
 from servoscope.isolation.candidate import UNKNOWN, Candidate
-
-if TYPE_CHECKING:  # its kernels are loaded after an alarm, not before
-    from servoscope.isolation.ml import RefitResult, TimelineStretch
+from servoscope.isolation.ml import MAX_WINDOW_SAMPLES, RefitResult, TimelineStretch, find_timeline, is_constant
+from servoscope.isolation.ml.window import RefitWindow
 
 MARGIN_S = 1.0  # before the earliest onset, from which the past is not sure to be healthy
 
@@ -33,9 +31,6 @@ def trace_timeline(
     Looked at from the refit's first sample on, where its single change does not explain the recording, does not last,
     or does not stay the same. A stretch that nothing explains leaves the single change as it was.
     """
-    from servoscope.isolation.ml import MAX_WINDOW_SAMPLES, find_timeline, is_constant
-    from servoscope.isolation.ml.window import RefitWindow
-
     if exam.baseline.axis is not None:  # its search knows linear plants only
         return ()
     explained = not refined.is_unknown and refined.goodness.statistic <= refined.goodness.limit

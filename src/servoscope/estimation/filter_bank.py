@@ -140,14 +140,9 @@ def instrument_system(loop: Loop) -> LinearSystem:
     return whole.input(np.eye(3, 1)).output(np.eye(1, 2, 1))
 
 
-def filter_cutoff(loop: Loop) -> float:
-    """Return the cutoff of the state-variable filter [Hz]."""
-    return loop.cutoff
-
-
 def _svf_paths(loop: Loop) -> tuple[LinearSystem, LinearSystem, list[LinearSystem], int]:
     """Return u -> eta, y -> phi, extras -> phi, and the samples to wait."""
-    plant, rate, cutoff = loop.plant, loop.sample_rate, filter_cutoff(loop)
+    plant, rate, cutoff = loop.plant, loop.sample_rate, loop.cutoff
     order = max((1, *plant.powers)) + 1
     continuous = state_variable_filter(cutoff, order)
     to_eta = sample_system(continuous, rate, loop.hold, loop.delay).output(plant.input_gain * np.eye(1, order))
@@ -163,7 +158,7 @@ def _instrument_path(loop: Loop, instrument: InstrumentModel, to_phi: LinearSyst
     if not instrument.derivative:
         return instrument.system.then(to_phi)
     powers = loop.plant.powers
-    continuous = state_variable_filter(filter_cutoff(loop), max((1, *powers)) + 1)
+    continuous = state_variable_filter(loop.cutoff, max((1, *powers)) + 1)
     rows = np.eye(len(continuous[0]))[[power - instrument.derivative for power in powers]]
     return instrument.system.then(sample_system(continuous, loop.sample_rate, "foh").output(rows))
 
@@ -235,7 +230,7 @@ def build_filter_bank(loop: Loop, instrument: InstrumentModel | None = None) -> 
         gain=plant.input_gain,
         wait=wait,
         sample_rate=loop.sample_rate,
-        poles=np.full(max((1, *plant.powers)) + 1, math.exp(-2.0 * math.pi * filter_cutoff(loop) / loop.sample_rate))
+        poles=np.full(max((1, *plant.powers)) + 1, math.exp(-2.0 * math.pi * loop.cutoff / loop.sample_rate))
         if svf
         else np.zeros(0),
     )

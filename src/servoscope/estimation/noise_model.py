@@ -14,6 +14,7 @@ import numpy as np
 
 from servoscope.core.arrays import ComplexArray, FloatArray
 from servoscope.estimation.filter_bank import FilterBank
+from servoscope.models.lfilter import lfilter
 from servoscope.models.lti import LinearSystem, autocovariances, decimate_noise, innovation_gain, scale_to_noise
 
 AR_ORDER = 10
@@ -78,16 +79,12 @@ class ArmaNoise:
 
     def whiten(self, x: FloatArray) -> FloatArray:
         """Return innovations of unit variance for a column or columns of v, shape (N,) or (N, m)."""
-        from servoscope.models.lfilter import lfilter
-
         A, B = self.polynomials
         white: FloatArray = lfilter(A, B, x) / np.sqrt(self.variance)
         return white
 
     def shape(self, x: FloatArray) -> FloatArray:
         """Return x passed through the filter that turns white noise of unit variance into v, shape as x."""
-        from servoscope.models.lfilter import lfilter
-
         A, B = self.polynomials
         shaped: FloatArray = lfilter(B, A, x) * np.sqrt(self.variance)
         return shaped
@@ -204,8 +201,6 @@ def colour_error(model: ArmaNoise, system: LinearSystem, stride: int) -> float:
     The largest of the error of the variance and the autocorrelations, up to `WHITENESS_LAGS`.
     """
     gamma = autocovariances(scale_to_noise(system), WHITENESS_LAGS + len(model.a) + RESPONSE_SAMPLES, stride)[:, 0, 0]
-    from servoscope.models.lfilter import lfilter
-
     A, B = model.polynomials
     impulse = np.zeros(RESPONSE_SAMPLES)
     impulse[0] = 1.0

@@ -5,26 +5,25 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.errors import LoopError
-from servoscope.estimation import filter_bank
+from servoscope.estimation import estimators, filter_bank
 from servoscope.estimation.filter_bank import FilterBank
 from servoscope.estimation.instrument import InstrumentTuning, instrument_model
+from servoscope.estimation.kernel.cusum import CusumConstants
+from servoscope.estimation.moments import add_products
 from servoscope.estimation.noise_model import ArmaNoise, WhiteNoise
+from servoscope.estimation.recursion import EvaluationConstants, Recursion, RecursionConstants
 from servoscope.estimation.two_stage import StageOneRunner, StageOneTuning
 from servoscope.estimation.valve import ValveLaw, integer_delay
+from servoscope.models.loop import Loop
 from servoscope.models.lti import LinearSystem
 from servoscope.models.plants.polynomial import PolynomialPlant
 from servoscope.signals import Recording
-
-if TYPE_CHECKING:
-    from servoscope.estimation.kernel.cusum import CusumConstants
-    from servoscope.estimation.recursion import EvaluationConstants, Recursion, RecursionConstants
-    from servoscope.models.loop import Loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +103,6 @@ class Pipeline:
         learned one, or that of the nominal closed loop. Raises LoopError if the structure does not suit the plant, the
         instrument cannot be made, stage 1 is missing, or it meets a valve law.
         """
-        from servoscope.estimation import estimators
-
         if loop.monitor.two_stage != "none" and stage_one is None:
             raise LoopError(f"{loop.name}: [monitor] two_stage = 'adaptive' needs a tuned stage 1: learn a baseline")
         if loop.monitor.two_stage != "none" and ValveLaw(loop).size:
@@ -139,7 +136,7 @@ class Pipeline:
         """
         if self.bank.structure != "svf":
             return 1
-        return max(1, int(self.loop.sample_rate / (10.0 * filter_bank.filter_cutoff(self.loop))))
+        return max(1, int(self.loop.sample_rate / (10.0 * self.loop.cutoff)))
 
     @property
     def memory(self) -> float:
@@ -169,9 +166,6 @@ class Pipeline:
         `watch` is the sequential test, if there is one. Without `view` there are only the evaluations that a diagnosis
         takes. `steady` says that P begins at P_d, so that an estimator that leaves it there needs none.
         """
-        from servoscope.estimation import estimators
-        from servoscope.estimation.recursion import RecursionConstants
-
         loop, bank, name = self.loop, self.bank, self.loop.monitor.estimator
         steady = steady and hasattr(estimators.load_estimator(name), "steady_gain")
         # phi times this has P_d = I; the scale keeps Cholesky's factor from mixing units
@@ -255,7 +249,7 @@ class Pipeline:
     def kinematics(self) -> Pipeline:
         """What forms position, speed and acceleration of a signal behind a filter with the loop's cutoff."""
         loop = self.loop
-        plain = {"structure": "svf", "cutoff": filter_bank.filter_cutoff(loop), "estimator": "akf", "two_stage": "none"}
+        plain = {"structure": "svf", "cutoff": loop.cutoff, "estimator": "akf", "two_stage": "none"}
         update = {
             "plant": PolynomialPlant(order=2, stiffness=True),
             "monitor": loop.monitor.model_copy(update=plain),
@@ -272,8 +266,6 @@ class Pipeline:
     @cached_property
     def _plain(self) -> Recursion:
         """The recursion that only forms regressors; cached, for signatures need it many times."""
-        from servoscope.estimation.recursion import Recursion
-
         return Recursion([self.constants(self.blank())])
 
     def regression(self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> Regression:
@@ -326,8 +318,6 @@ def _products(n: int, basis: bytes) -> tuple[_Elements, _Elements]:
 
 def _transform_rows(rows: FloatArray, matrix: _Elements) -> FloatArray:
     """Return a matrix (p, m) times each of K rows, shape (K, p); a row's bits do not depend on the others."""
-    from servoscope.estimation.moments import add_products  # late: loads numba
-
     transformed = np.zeros((matrix.p, len(rows)))
     add_products(*matrix[1:], np.ascontiguousarray(rows.T, dtype=np.float64), transformed)
     return np.ascontiguousarray(transformed.T)
@@ -358,8 +348,6 @@ class EstimationRunner:
     """Runs the recursion block by block, from the tuning's theta, to the same result wherever a recording is cut."""
 
     def __init__(self, pipeline: Pipeline, tuning: Tuning, watch: CusumConstants | None = None) -> None:
-        from servoscope.estimation.recursion import Recursion
-
         self._pipeline, self._ahead = pipeline, _InputStage(pipeline)
         self._constants = pipeline.constants(tuning, watch)
         self._recursion = Recursion([self._constants])

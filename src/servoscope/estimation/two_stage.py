@@ -11,27 +11,25 @@ from __future__ import annotations
 import functools
 import math
 import operator
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import NotEnoughError
-from servoscope.core.jit import Bool, Float, dot, fma, maximum, minimum
-from servoscope.core.jit.llvm_text import LlvmPrinter
+from servoscope.core.jit import Float, dot, fma, maximum, minimum
+from servoscope.core.jit.array_function import ArrayFunction
+from servoscope.core.jit.arrays import Array
 from servoscope.core.jit.memory import Memory, apply
-from servoscope.core.jit.native import address, native_function
-from servoscope.core.jit.symbolic import Int
 from servoscope.estimation import estimators
 from servoscope.estimation.kernel import sparse_lti
 from servoscope.estimation.update import read_matrix, write_matrix
+from servoscope.models.loop import Loop
 from servoscope.models.lti import LinearSystem, tapped_delay_line
 from servoscope.signals import Recording
-
-if TYPE_CHECKING:
-    from servoscope.models.loop import Loop
 
 LENGTHS = {"fir": 40, "laguerre": 12}  # functions, where a loop file does not say
 RIDGE = 1e-4  # of the mean excitation: what r excites less is not learned, and adds no noise to u_a
@@ -48,23 +46,6 @@ class StageOneTuning:
     theta: tuple[float, ...]  # weights of the functions, shape (n,)
     P_d: tuple[tuple[float, ...], ...]  # desired covariance, shape (n, n)
     R: float  # variance of u - u_a
-
-
-class StageOneConstants(NamedTuple):
-    """What the compiled stage takes: the functions of r as a linear system, and the tuning.
-
-    `functions` are the packed coefficients of the system, X0 its steady state; P_d is filled up with zeros to whole
-    vectors.
-    """
-
-    functions: FloatArray
-    X0: FloatArray
-    limits: tuple[float, float]
-    wait: int
-    theta: FloatArray
-    P_d: FloatArray
-    R: float
-    memory: float
 
 
 def basis_functions(loop: Loop) -> LinearSystem:
@@ -110,33 +91,23 @@ class StageOneRunner:
         system = basis_functions(loop)
         infinite = (-np.inf, np.inf)
         limits = (loop.input_limits or infinite) if loop.input_logged == "before_limiter" else infinite
-        pattern, P_d = sparse_lti.sparsity_pattern([system]), np.array(tuning.P_d, dtype=np.float64)
-        padding = 0, _vector_count(len(P_d)) * VECTOR_WIDTH - len(P_d)
-        self._constants = StageOneConstants(
-            functions=sparse_lti.pack_coefficients(pattern, system),
-            X0=np.ascontiguousarray(system.steady[:, 0]),
-            limits=limits,
-            wait=basis_settling_samples(system),
-            theta=np.array(tuning.theta, dtype=np.float64),
-            P_d=np.pad(P_d, padding),
-            R=tuning.R,
-            memory=loop.monitor.memory * loop.sample_rate,
-        )
-        n, name = len(tuning.theta), loop.monitor.estimator
-        self._steady = hasattr(estimators.load_estimator(name), "steady_gain")
-        own_P = 0 if self._steady else n * n
-        extra = estimators.extra_state_size(name, n, self._constants.memory)
-        self.size = HEADER_SIZE + len(system.A) + n + own_P + extra
-        self._block = compile_stage_one(name, pattern)
+        P_d, n = np.array(tuning.P_d, dtype=np.float64), len(tuning.theta)
+        padded = np.pad(P_d, (0, _vector_count(n) * VECTOR_WIDTH - n))  # with zeros, to whole vectors
+        name, memory = loop.monitor.estimator, loop.monitor.memory * loop.sample_rate
+        estimator, pattern = estimators.load_estimator(name), sparse_lti.sparsity_pattern([system])
+        self._compiled: dict[str, Any] = {"estimator": estimator, "pattern": pattern}
+        functions = sparse_lti.pack_coefficients(pattern, system)
+        self._constants = functions, np.ascontiguousarray(system.steady[:, 0]), padded.ravel()
+        self._numbers = tuning.R, memory, float(basis_settling_samples(system)), *map(float, limits)
+        own_P = np.zeros(0) if hasattr(estimator, "steady_gain") else P_d.ravel()
+        private = np.zeros(estimators.extra_state_size(name, n, memory))
+        parts = np.zeros(HEADER_SIZE), np.zeros(len(system.A)), np.array(tuning.theta), own_P, private
+        self._start, self._cuts = np.concatenate(parts), np.cumsum([len(part) for part in parts])[:-1]
+        self.size = len(self._start)
 
     def start(self) -> FloatArray:
         """Return the state before the first sample, shape (size,)."""
-        if not self.size:
-            return np.zeros(0)
-        c = self._constants
-        P = np.zeros(0) if self._steady else c.P_d[: len(c.theta), : len(c.theta)].ravel()
-        used = np.concatenate([np.zeros(HEADER_SIZE + len(c.X0)), c.theta, P])
-        return np.pad(used, (0, self.size - len(used)))
+        return self._start.copy() if self.size else np.zeros(0)
 
     def run(self, state: FloatArray, r: FloatArray, u: FloatArray, restart: BoolArray) -> FloatArray:
         """Return u_a of a block, shape (N,), and change `state` (size,) in place.
@@ -146,11 +117,9 @@ class StageOneRunner:
         """
         if not self.size:
             return u
-        u_a = np.empty(len(r))
-        c = self._constants
-        signals = (np.ascontiguousarray(x, dtype=np.float64) for x in (r, u))
-        arrays = [state, c.functions, c.X0, c.P_d, *signals, np.ascontiguousarray(restart), u_a]
-        self._block(*map(address, arrays), c.R, c.memory, float(c.wait), *c.limits, len(r))
+        u_a, signals = np.empty(len(r)), [np.asarray(x, dtype=np.float64) for x in (r, u)]
+        parts = np.split(state, self._cuts)
+        run_stage_one(*parts, *self._constants, *signals, restart, u_a, *self._numbers, **self._compiled)
         return u_a
 
 
@@ -190,40 +159,24 @@ def tune_stage_one(loop: Loop, recordings: Sequence[Recording]) -> StageOneTunin
     return StageOneTuning(tuple(theta.tolist()), tuple(tuple(row) for row in P_d.tolist()), R)
 
 
-ARGUMENTS = (
-    *((name, "ptr") for name in ("state", "functions", "X0", "P_d", "r", "u", "restart", "u_a")),
-    *((name, "double") for name in ("R", "memory", "wait", "low", "high")),
-    ("samples", "i64"),
-)
-
-
-@functools.cache
-def compile_stage_one(estimator: str, pattern: sparse_lti.SparsityPattern) -> Callable[..., None]:
-    """Compile stage 1 around one estimator and the functions of r; its arguments are `ARGUMENTS`.
+@ArrayFunction
+def run_stage_one(
+    printer: Any, head: Any, x: Any, weights: Any, P: Any, extra: Any, functions: Any, X0: Any, P_d: Any, r: Any,
+    u: Any, restart: Any, u_a: Any, R: Any, memory: Any, wait: Any, low: Any, high: Any, *,
+    estimator: ModuleType, pattern: sparse_lti.SparsityPattern,
+) -> None:  # fmt: skip
+    """Run stage 1 around one estimator and the functions of r; head, x, weights, P and `extra` are its state.
 
     Products of long vectors are summed up in `VECTOR_WIDTH` lanes.
     """
-    p, module = LlvmPrinter(ARGUMENTS), estimators.load_estimator(estimator)
-    n, states, steady = len(pattern[0]), len(pattern[1]), hasattr(module, "steady_gain")
+    n, steady = len(pattern[0]), hasattr(estimator, "steady_gain")
     rows, size = _vector_count(n), _vector_count(n) * VECTOR_WIDTH
-    R, memory, wait, low, high = (Float(p, f"%{name}", "double") for name in ("R", "memory", "wait", "low", "high"))
-    head, functions, X0, P_d = (Memory(p, f"%{name}", "double") for name in ("state", "functions", "X0", "P_d"))
-    x = head.behind(HEADER_SIZE)
-    weights, private = x.behind(states), x.behind(states + n + n * n)
-    phi, theta, K, sums = (Memory(p, p.stack("double", max(size, 2 * VECTOR_WIDTH)), "double") for _ in range(4))
-
-    def begin(s: Any, x: Any, X0: Any, r: Any) -> None:
-        s[ARMED], s[WAIT] = 1.0, wait
-        for i in range(states):
-            x[i] = X0[i] * r[0]
-
-    def evaluate_functions(c: Any, x: Any, r: Any, phi: Any) -> None:
-        for i, number in enumerate(sparse_lti.advance_system(pattern, c, 0, x, 0, [r[0]])):
-            phi[i] = number
+    phi, theta, K, sums = (Array.scratch(printer, "double", max(size, 2 * VECTOR_WIDTH)) for _ in range(4))
+    wide = [Memory(printer, array.base, "double", VECTOR_WIDTH) for array in (phi, theta, K, sums)]
 
     def multiply(P_d: Any, phi: Any, K: Any) -> None:
         """Put P_d phi into K, column by column."""
-        totals = [Float(p, p.constant(0.0, K.kind), K.kind)] * rows
+        totals = [Float(printer, printer.constant(0.0, K.kind), K.kind)] * rows
         for k in range(size):
             totals = [fma(P_d[k * rows + i], phi[k], total) for i, total in enumerate(totals)]
         for i, total in enumerate(totals):
@@ -234,62 +187,50 @@ def compile_stage_one(estimator: str, pattern: sparse_lti.SparsityPattern) -> Ca
         for place, other in enumerate((theta, K)):
             sums[place] = dot([phi[i] for i in range(rows)], [other[i] for i in range(rows)])
 
-    def output(sums: Any, u_a: Any) -> None:
-        u_a[0] = functools.reduce(operator.add, [sums[i] for i in range(VECTOR_WIDTH)], 0.0)
-
-    def update_steady(theta: Any, K: Any, sums: Any, u: Any) -> None:
+    def update_steady(entering: Any) -> None:
         """Update theta where P stays at P_d: K = P_d phi/(R + phi' P_d phi)."""
-        residual, denominator = minimum(maximum(u[0], low), high), R
+        residual, denominator = entering, R
         for i in range(VECTOR_WIDTH):
             residual, denominator = residual - sums[i], denominator + sums[VECTOR_WIDTH + i]
         for i in range(n):
             theta[i] = theta[i] + K[i] * (residual / denominator)
 
-    def update_general(theta: Any, phi: Any, P: Any, P_d: Any, u: Any, extra: Any) -> None:
+    def update_general(entering: Any) -> None:
         """Update theta and P by any estimator."""
-        signals, w = [phi[i] for i in range(n)], minimum(maximum(u[0], low), high)
-        matrices = read_matrix(P, n), read_matrix(P_d, n, apart=size)
-        new = module.update([theta[i] for i in range(n)], *matrices, R, memory, w, signals, signals, extra)
+        signals, matrices = [phi[i] for i in range(n)], (read_matrix(P, n), read_matrix(P_d, n, apart=size))
+        new = estimator.update([theta[i] for i in range(n)], *matrices, R, memory, entering, signals, signals, extra)
         for i in range(n):
             theta[i] = new.theta[i]
         write_matrix(P, new.P)
 
-    def process(r: Memory, u: Memory, u_a: Memory, k: Int) -> None:
-        flag = p.compare_whole(">", p.assign(f"zext i8 {p.load('i8', p.place('i8', '%restart', k))} to i64"), "0")
-        with p.when(Bool(p, flag, "i1") | (Float(p, head.load(ARMED), "double") <= 0.0)):
-            apply(begin, head, x, X0, r)
-        apply(evaluate_functions, functions, x, r, phi)
-        waiting = Float(p, head.load(WAIT), "double")
-        with p.when(waiting > 0.0):
-            head.store(WAIT, (waiting - 1.0).text)
-        with p.when(waiting <= 0.0):
-            wide = [memory.regrouped(VECTOR_WIDTH) for memory in (phi, theta, K, sums)]
-            if steady:
-                apply(multiply, P_d.regrouped(VECTOR_WIDTH), phi.regrouped(VECTOR_WIDTH, shared=True), wide[2])
-            apply(products, *wide)
-            apply(output, sums, u_a)
-            if steady:
-                apply(update_steady, theta, K, sums, u)
-            else:
-                apply(update_general, theta, phi, weights.behind(n), P_d, u, private)
-
-    for i in p.loop(0, size):
-        for row in (phi, theta, K):
-            row.store(i, p.constant(0.0, "double"))
-    for i in p.loop(0, n):
-        theta.store(i, weights.load(i))
-    for k in p.loop(0, p.argument("samples")):
-        r, u, u_a = (Memory(p, p.place("double", f"%{name}", k), "double") for name in ("r", "u", "u_a"))
-        u_a.store(0, p.constant(math.nan, "double"))
-        finite = (abs(Float(p, r.load(0), "double")) < math.inf) & (abs(Float(p, u.load(0), "double")) < math.inf)
-        with p.when(finite):
-            process(r, u, u_a, k)
-        with p.when(~finite):
-            head.store(ARMED, p.constant(0.0, "double"))
-    for i in p.loop(0, n):
-        weights.store(i, theta.load(i))
-    p.write("ret void")
-    return native_function(p.text(), ARGUMENTS)
+    for i in printer.loop(0, size):
+        phi[i] = theta[i] = K[i] = 0.0
+    for i in printer.loop(0, n):
+        theta[i] = weights[i]
+    for k in printer.loop(0, r.shape[0]):
+        u_a[k] = math.nan
+        finite = (abs(r[k]) < math.inf) & (abs(u[k]) < math.inf)
+        with printer.when(finite):
+            with printer.when((restart[k] > 0) | (head[ARMED] <= 0.0)):
+                head[ARMED], head[WAIT] = 1.0, wait
+                for i in range(len(pattern[1])):
+                    x[i] = X0[i] * r[k]
+            for i, number in enumerate(sparse_lti.advance_system(pattern, functions, 0, x, 0, [r[k]])):
+                phi[i] = number
+            waiting = head[WAIT]
+            with printer.when(waiting > 0.0):
+                head[WAIT] = waiting - 1.0
+            with printer.when(waiting <= 0.0):
+                if steady:
+                    columns = Memory(printer, P_d.base, "double", VECTOR_WIDTH)
+                    apply(multiply, columns, replace(wide[0], shared=True), wide[2])
+                apply(products, *wide)
+                u_a[k] = functools.reduce(operator.add, [sums[i] for i in range(VECTOR_WIDTH)], 0.0)
+                (update_steady if steady else update_general)(minimum(maximum(u[k], low), high))
+        with printer.when(~finite):
+            head[ARMED] = 0.0
+    for i in printer.loop(0, n):
+        weights[i] = theta[i]
 
 
 def _vector_count(n: int) -> int:

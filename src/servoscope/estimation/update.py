@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from servoscope.core.arrays import FloatArray
 from servoscope.core.jit import where
+from servoscope.core.jit.array_function import ArrayFunction
 from servoscope.core.jit.arrays import Variable
-from servoscope.core.jit.llvm_text import LlvmPrinter
-from servoscope.core.jit.memory import Memory, apply
-from servoscope.core.jit.native import address, native_function
-from servoscope.core.jit.symbolic import Float
 
 Numbers = list[Any]
 Matrix = list[Numbers]
@@ -50,13 +44,10 @@ def read_matrix(rows: Any, n: int, begin: int = 0, apart: int = 0) -> Matrix:
     return [[rows[begin + (apart or n) * i + j] for j in range(n)] for i in range(n)]
 
 
-def write_matrix(rows: Any, matrix: Matrix, begin: int = 0) -> None:
+def write_matrix(rows: Any, matrix: Matrix, begin: Any = 0) -> None:
     """Write a matrix row by row from some place on."""
     for i, number in enumerate(number for row in matrix for number in row):
         rows[begin + i] = number
-
-
-ARRAYS = ("theta", "P", "P_d", "eta", "phi", "z", "K", "extra")
 
 
 def run_updates(
@@ -67,31 +58,23 @@ def run_updates(
 
     theta, P, the gain K of the last update and the private state `extra` are changed in place.
     """
-    arrays = theta, P, P_d, *map(np.ascontiguousarray, (eta, phi, z)), K, extra
-    places = (address(array) for array in arrays)
-    return int(_compile_updates(estimator, len(theta))(*places, R, memory, len(eta)))
+    arrays = theta, P, P_d, float(R), float(memory), eta, phi, z, K, extra
+    return int(_run_updates(*arrays, estimator=estimator, n=len(theta)))
 
 
-@functools.cache
-def _compile_updates(estimator: ModuleType, n: int) -> Callable[..., int]:
-    arguments = (*((name, "ptr") for name in ARRAYS), ("R", "double"), ("memory", "double"), ("samples", "i64"))
-    p = LlvmPrinter(arguments, "i64")
-    R, memory = (Float(p, f"%{name}", "double") for name in ("R", "memory"))
-    refused = Variable(p, 0)
-
-    def step(theta: Any, P: Any, P_d: Any, eta: Any, phi: Any, z: Any, K: Any, extra: Any) -> Any:
-        signals = eta[0], [phi[i] for i in range(n)], [z[i] for i in range(n)]
-        new = estimator.update(
-            [theta[i] for i in range(n)], read_matrix(P, n), read_matrix(P_d, n), R, memory, *signals, extra
-        )
+@ArrayFunction
+def _run_updates(
+    printer: Any, theta: Any, P: Any, P_d: Any, R: Any, memory: Any, eta: Any, phi: Any, z: Any, K: Any, extra: Any, *,
+    estimator: ModuleType, n: int,
+) -> Any:  # fmt: skip
+    refused = Variable(printer, 0)
+    for k in printer.loop(0, eta.shape[0]):
+        vectors = [[x[i] for i in range(n)] for x in (theta, phi[k], z[k])]
+        matrices = [[[x[i, j] for j in range(n)] for i in range(n)] for x in (P, P_d)]
+        new = estimator.update(vectors[0], *matrices, R, memory, eta[k], *vectors[1:], extra)
         for i in range(n):
             theta[i], K[i] = new.theta[i], new.K[i]
-        write_matrix(P, new.P)
-        return new.refused
-
-    for k in p.loop(0, p.argument("samples")):
-        memories = [Memory(p, f"%{name}", "double") for name in ARRAYS]
-        memories[3:6] = memories[3].behind(k), memories[4].behind(k * n), memories[5].behind(k * n)
-        refused.value = refused.value + p.truncate(R * 0.0 + apply(step, *memories))
-    p.write(f"ret i64 {refused.value}")
-    return native_function(p.text(), arguments, "i64")
+            for j in range(n):
+                P[i, j] = new.P[i][j]
+        refused.value = refused.value + printer.truncate(R * 0.0 + new.refused)
+    return refused.value

@@ -8,7 +8,7 @@ pressure comes from the motion, p_L = (m_p y'' + b_p y' + k_p y)/A_p, with y as 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.jit import maximum, minimum, sqrt, sum_products, where
 from servoscope.core.jit.array_function import ArrayFunction
 from servoscope.core.jit.arrays import Variable
-from servoscope.estimation.filter_bank import filter_cutoff
 from servoscope.models.discretise import split_delay
 from servoscope.models.loop import Loop
 from servoscope.models.lti import sample_system, state_variable_filter
@@ -25,21 +24,6 @@ ORDER = 3  # of the differentiator: one more than the derivatives it gives
 CUTOFF_RATIO = 2.0  # its cutoff against that of the filter bank, so that p_L does not lag behind the motion
 ARMED, HEADER_SIZE = 0, 1
 MAX_PHYSICAL = 1e100  # as in the recursion: no physical signal, and it would stay in the filter for ever
-
-
-class ValveConstants(NamedTuple):
-    """Constants of the kernel: the filter y -> p_L/p_s (A, B, C, D, steady X0), limits, sign and delay of u."""
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: float
-    X0: FloatArray
-    low: float
-    high: float
-    sign: float
-    area_ratio: float  # of the rod's side over the other
-    delay: int  # samples
 
 
 def integer_delay(loop: Loop) -> float:
@@ -55,24 +39,17 @@ class ValveLaw:
         if loop.plant.load_pressure is None:
             return
         rate, (of_y, *of_derivatives) = loop.sample_rate, loop.plant.load_pressure
-        cutoff = min(CUTOFF_RATIO * filter_cutoff(loop), 0.25 * rate)
+        cutoff = min(CUTOFF_RATIO * loop.cutoff, 0.25 * rate)
         moving = np.array([[0.0, *of_derivatives]])
         filtered = sample_system(state_variable_filter(cutoff, ORDER), rate, "foh").output(moving)
         limits = loop.input_limits if loop.input_logged == "before_limiter" else None
         low, high = limits or (-np.inf, np.inf)
-        self._constants = ValveConstants(
-            A=np.ascontiguousarray(filtered.A),
-            B=np.ascontiguousarray(filtered.B[:, 0]),
-            C=np.ascontiguousarray(filtered.C[0]),
-            D=float(filtered.D[0, 0]) + of_y,
-            X0=np.ascontiguousarray(filtered.steady[:, 0]),
-            low=low,
-            high=high,
-            sign=math.copysign(1.0, loop.plant.input_gain),
-            area_ratio=loop.plant.retraction_gain**2,
-            delay=split_delay(loop.delay, rate)[0],
-        )
-        self.size = HEADER_SIZE + len(filtered.A) + self._constants.delay
+        columns = filtered.A, filtered.B[:, 0], filtered.C[0], filtered.steady[:, 0]
+        sign, delay = math.copysign(1.0, loop.plant.input_gain), split_delay(loop.delay, rate)[0]
+        numbers = float(filtered.D[0, 0]) + of_y, low, high, sign, loop.plant.retraction_gain**2, delay
+        self._constants = *map(np.ascontiguousarray, columns), *numbers
+        self._states = len(filtered.A)
+        self.size = HEADER_SIZE + self._states + delay
 
     def start(self) -> FloatArray:
         """Return the state before the first sample, shape (size,)."""
@@ -86,32 +63,34 @@ class ValveLaw:
         if not self.size:
             return self._plant.effective_input(u)
         out = np.empty(len(u))
-        _run_square_root(self._constants, state, u, y, restart, out, n=len(self._constants.X0))
+        _run_square_root(*self._constants, state, u, y, restart, out, n=self._states)
         return out
 
 
 @ArrayFunction
 def _run_square_root(
-    printer: Any, c: ValveConstants, s: Any, u: Any, y: Any, restart: Any, out: Any, *, n: int
-) -> None:
+    printer: Any, A: Any, B: Any, C: Any, X0: Any, D: Any, low: Any, high: Any, sign: Any, area_ratio: Any, delay: Any,
+    s: Any, u: Any, y: Any, restart: Any, out: Any, *, n: int,
+) -> None:  # fmt: skip
+    """Write the flow: A, B, C, D, X0 are the filter y -> p_L/p_s and its steady state; the rest is of u."""
     for k in printer.loop(0, u.shape[0]):
         known = (abs(u[k]) < MAX_PHYSICAL) & (abs(y[k]) < MAX_PHYSICAL)
         with printer.when(~known):
             s[ARMED], out[k] = 0.0, math.nan
         with printer.when(known):
-            now = Variable(printer, minimum(maximum(u[k], c.low), c.high))
+            now = Variable(printer, minimum(maximum(u[k], low), high))
             past = HEADER_SIZE + n
             with printer.when((restart[k] > 0) | s[ARMED].is_equal(0.0)):
                 s[ARMED] = 1.0
                 for i in range(n):
-                    s[HEADER_SIZE + i] = c.X0[i] * y[k]
-                for i in printer.loop(0, c.delay):
+                    s[HEADER_SIZE + i] = X0[i] * y[k]
+                for i in printer.loop(0, delay):
                     s[i + past] = now.value
-            x, pressure = [s[HEADER_SIZE + i] for i in range(n)], c.D * y[k]
+            x, pressure = [s[HEADER_SIZE + i] for i in range(n)], D * y[k]
             for i in range(n):
-                pressure = pressure + c.C[i] * x[i]
-                s[HEADER_SIZE + i] = sum_products([c.A[i, j] for j in range(n)], x, c.B[i] * y[k])
-            for i in printer.loop(0, c.delay):
+                pressure = pressure + C[i] * x[i]
+                s[HEADER_SIZE + i] = sum_products([A[i, j] for j in range(n)], x, B[i] * y[k])
+            for i in printer.loop(0, delay):
                 now.value, s[i + past] = s[i + past], now.value
-            left = where(c.sign * now.value > 0.0, 1.0 - pressure, c.area_ratio + pressure)
+            left = where(sign * now.value > 0.0, 1.0 - pressure, area_ratio + pressure)
             out[k] = now.value * sqrt(maximum(left, 0.0))

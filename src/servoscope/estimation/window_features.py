@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
-from servoscope.estimation.window_state import HEADER, ROW_HEADER
+from servoscope.estimation.window_kernel import HEADER, ROW_HEADER, accumulate_windows
 
 MOTIONS = ("forward", "backward", "rest")
 SIGNALS = ("u", "e")
@@ -156,6 +156,7 @@ class WindowLanes:
         for row, asset in zip(self._table, assets, strict=True):
             if asset is not None:
                 row[: asset.constants.size] = asset.constants
+        self._bands = sorted({features.layout.bands for features in known})
         self._shortest = min(features.layout.window for features in known)
         self._levels, self._sums = (
             max(getattr(features.layout, name) for features in known) for name in ("levels", "sums")
@@ -165,11 +166,11 @@ class WindowLanes:
         self, rows: FloatArray, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray
     ) -> Iterator[tuple[int, Window]]:
         """Feed a block, each of shape (assets, N); change the rows; yield asset and window, asset by asset."""
-        from servoscope.estimation.window_kernel import accumulate_windows  # late: it imports Numba
-
         most = len(rows) * self._levels * (r.shape[1] // self._shortest + 1)
         out, lane = np.empty((most, ROW_HEADER + self._sums)), np.empty(most, dtype=np.int64)
-        count = accumulate_windows(self._table, rows, self._begins, r, u, y, restart, out, lane)
+        count = 0
+        for bands in self._bands:
+            count = accumulate_windows(self._table, rows, self._begins, r, u, y, restart, out, lane, count, bands=bands)
         for asset, row in zip(lane[:count].tolist(), out, strict=False):
             if (features := self._assets[asset]) is not None:
                 yield asset, features.window(row)

@@ -33,7 +33,7 @@ from servoscope.detection.trace import UNSEEN_EXCESS, Statistic, any_exceeded, d
 from servoscope.detection.warm_up import follow_warm_up
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.estimation.pipeline import Estimates, EstimationRunner, Pipeline, Tuning
-from servoscope.isolation.ml.axis_scan import AxisChange
+from servoscope.isolation.ml.axis_scan import AxisChange, find_axis_change
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 from servoscope.simulation.stability import settling_samples
@@ -107,8 +107,6 @@ class Examination:
             exam = _run_recursion(baseline, recording, exam.pipeline, along, growth)
         change, exam = None, exam if along is None else replace(exam, along=along)
         if baseline.axis is not None and not exam.drifts:
-            from servoscope.isolation.ml.axis_scan import find_axis_change
-
             change = find_axis_change(baseline, recording)
         return replace(exam, skipped_share=skipped, replaced=replaced, apparent_change=change, quick=quick)
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from servoscope.core.jit import maximum, where
+from servoscope.core.jit import Int, maximum, where
 from servoscope.core.jit.array_function import ArrayFunction
 from servoscope.core.jit.arrays import Array, Variable, add_terms
 from servoscope.core.jit.symbolic import Complex
@@ -40,7 +40,7 @@ def sample_plants(
         for i in range(n):
             unit.value = maximum(unit.value, abs(real(g[p, i])) * period)
 
-        for part in printer.loop(0, where(late > 0.0, printer.whole(2), 1)):
+        for part in printer.loop(0, where(late > 0.0, Int(printer, "2"), 1)):
             ends = part.is_equal(0)  # the end of a sample, then its beginning, when u is still the last
             duration = where(ends, 1.0 - late, late) * period
             for i in printer.loop(0, n):

@@ -11,7 +11,8 @@ import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.estimation.noise_model import WhiteNoise
-from servoscope.fit.kernels import Array
+from servoscope.fit.kernels import Array, innovations
+from servoscope.fit.plant_kernels import sample_plants
 from servoscope.models.discretise import discretise, split_delay
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
@@ -50,8 +51,6 @@ class Predictor(NamedTuple):
 
         Shape (N,), or (V, N) for V variants of the change, the rows of `plants` (V, p): which ones it goes through.
         """
-        from servoscope.fit.kernels import innovations
-
         rows = np.arange(len(self.b))[None] if plants is None else plants
         e: Array = innovations(*self, rows, onset, duration, u, y, restart)
         return e[0] if plants is None else e
@@ -101,8 +100,6 @@ class PredictorFactory:
         The parameters of the plants may be complex, and `output_gains` (P,) multiply their y. `later_s` [s] is delay
         beyond the loop file's; `noise` takes the place of the factory's, but for the state after a restart.
         """
-        from servoscope.fit.plant_kernels import sample_plants
-
         F, g, c = state_spaces
         F, g = F * self.scale / self.scale[:, None], g[..., 0] / self.scale
         c = c[:, 0] * self.scale * output_gains[:, None]

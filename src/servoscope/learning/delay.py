@@ -8,7 +8,6 @@ import numpy as np
 
 from servoscope.core.errors import RecordingError
 from servoscope.core.messages import Message, message
-from servoscope.estimation.filter_bank import filter_cutoff
 from servoscope.estimation.reference_period import reference_period
 from servoscope.learning.inspection import delay as alignment
 from servoscope.learning.inspection import model_order, residual
@@ -40,7 +39,7 @@ def check_delay(
     """
     recording = max(recordings, key=lambda candidate: candidate.samples)
     g = model_order.form_regressors(recording, loop)
-    to_rad = 2.0 * np.pi * filter_cutoff(loop)  # at the cutoff
+    to_rad = 2.0 * np.pi * loop.cutoff  # at the cutoff
     regression = _regression_delay(loop, recording, g)
     seconds = regression.seconds if regression is not None and regression.gain >= MIN_VARIANCE_SHARE else None
     if seconds is not None and loop.delay == 0.0 and -to_rad * seconds >= MIN_PHASE_NOTED:
@@ -90,7 +89,7 @@ def _unverified(
 
 def _regression_delay(loop: Loop, recording: Recording, g: model_order.Regressors) -> alignment.Delay | None:
     """Return the delay that leaves the least residual variance of the inverse; None without a regression."""
-    block = settling_samples(filter_cutoff(loop), g.bank.n, 1.0 / loop.sample_rate)
+    block = settling_samples(loop.cutoff, g.bank.n, 1.0 / loop.sample_rate)
     fit = model_order.fit_regression(g.bank.names, g.eta, g.phi, g.ok, block)
     if fit is None:
         return None

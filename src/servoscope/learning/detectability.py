@@ -13,7 +13,6 @@ from servoscope.baseline.threshold import SECONDS_PER_YEAR, threshold
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
 from servoscope.detection.statistic import noncentrality, required_noncentrality, t2_statistic
-from servoscope.estimation.filter_bank import filter_cutoff
 from servoscope.estimation.pipeline import Estimates, Pipeline
 from servoscope.estimation.tuning import TuningFit
 from servoscope.evidence.kind import HealthyRecordings
@@ -169,7 +168,7 @@ def noise_notes(pipeline: Pipeline, fit: TuningFit, estimates: Sequence[Estimate
     elif loop.controller is not None:
         remedy = message("learning.bias_instrument")
     else:
-        remedy = message("learning.bias_cutoff", cutoff_hz=filter_cutoff(loop) / 2.0)
+        remedy = message("learning.bias_cutoff", cutoff_hz=loop.cutoff / 2.0)
     values = {"bias": float(bias[at]), "std": float(std[at]), "frequency_hz": loop.monitor.frequencies[at]}
     return [message("learning.noise_bias", remedy=remedy, **values)]
 

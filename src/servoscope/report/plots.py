@@ -15,7 +15,6 @@ from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.result import Diagnosis
-from servoscope.estimation.filter_bank import filter_cutoff
 from servoscope.estimation.frequency_response import frequency_response
 from servoscope.learning.inspection import Inspection
 from servoscope.report.plotting import envelope
@@ -178,7 +177,7 @@ def _trace(thing: Trace) -> Picture:
 
 @_picture.register(Baseline)
 def _baseline(thing: Baseline) -> Picture:
-    highest = filter_cutoff(thing.loop)
+    highest = thing.loop.cutoff
     f = np.geomspace(0.01 * highest, highest, 200)
     response = frequency_response(thing.pipeline().bank, f, np.array(thing.theta), thing.covariance_array())
     H, C = response.H, response.covariance

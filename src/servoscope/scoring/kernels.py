@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from servoscope.core.jit import maximum, where
+from servoscope.core.jit import Int, maximum, where
 from servoscope.core.jit.array_function import ArrayFunction
 from servoscope.core.jit.arrays import Variable
 
@@ -16,5 +16,5 @@ def run_cusum(printer: Any, x: Any, k: Any, h: Any, alarm: Any) -> None:
     for t in printer.loop(0, x.shape[0]):
         up.value, down.value = maximum(up.value + x[t] - k, 0.0), maximum(down.value - x[t] - k, 0.0)
         exceeded = (up.value > h) | (down.value > h)
-        alarm[t] = where(exceeded, printer.whole(1), 0)
+        alarm[t] = where(exceeded, Int(printer, "1"), 0)
         up.value, down.value = where(exceeded, 0.0, up.value), where(exceeded, 0.0, down.value)

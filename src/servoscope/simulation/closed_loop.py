@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -12,8 +12,11 @@ import numpy.typing as npt
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
 from servoscope.models.discretise import discretise
+from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
+from servoscope.signals import Recording
 from servoscope.simulation.faults import FaultEvent, describe_plants, resolve_faults, schedule_plants
+from servoscope.simulation.linear_kernels import HEADER_SIZE, axis_constants, run_axis, run_linear
 from servoscope.simulation.measurement import (
     NOISE_U_STD,
     NOISE_Y_STD,
@@ -24,11 +27,8 @@ from servoscope.simulation.measurement import (
     draw_noise,
     make_recording,
 )
+from servoscope.simulation.nonlinear_eha import nonlinear_run
 from servoscope.simulation.stability import check_stable
-
-if TYPE_CHECKING:
-    from servoscope.models.loop import Loop
-    from servoscope.signals import Recording
 
 
 def simulate(
@@ -118,8 +118,6 @@ class LoopSimulation:
 
     def __init__(self, loop: Loop, plants: Sequence[Plant], called: Sequence[str] | None = None) -> None:
         settings = controller_constants(loop)
-        from servoscope.simulation import linear_kernels
-
         called = called or [f"plant {i + 1} of {len(plants)}" for i in range(len(plants))]
         discrete = [discretise(p.state_space(), loop.sample_rate, hold=loop.hold, delay=loop.delay) for p in plants]
         for discrete_plant, what in zip(discrete, called, strict=True):
@@ -127,23 +125,19 @@ class LoopSimulation:
         self._unlimited, self._feed = loop.input_logged != "after_limiter", FeedForward(loop)
         self._kernel: Callable[..., object]
         if not loop.plant.linear:
-            from servoscope.simulation.nonlinear_eha import nonlinear_run  # loads more than a linear loop needs
-
             self._kernel, states = nonlinear_run(loop, plants, settings), 5
         elif loop.plant.extras:
-            motion, states = linear_kernels.axis_constants(plants, loop), 2
+            motion, states = axis_constants(plants, loop), 2
             order = 2 if "inertia" in plants[0].names else 1
-            self._kernel = lambda which, *signals: linear_kernels.run_axis(
-                motion, which, settings, *signals, order=order
-            )
+            self._kernel = lambda which, *signals: run_axis(motion, which, settings, *signals, order=order)
         else:
             A, b_next, b_now, b_late, c = (np.stack([plant[i] for plant in discrete]) for i in range(5))
             states = c.shape[1]
-            self._kernel = lambda which, *signals: linear_kernels.run_linear(
+            self._kernel = lambda which, *signals: run_linear(
                 A, b_next, b_now, b_late, c, which, settings, *signals, n=states
             )
         self._state, self._past_input = (
-            np.zeros(linear_kernels.HEADER_SIZE + states),
+            np.zeros(HEADER_SIZE + states),
             np.zeros(settings.delay_samples + 2),
         )
 

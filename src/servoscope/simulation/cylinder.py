@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
+from servoscope.signals import Recording
+from servoscope.simulation.cylinder_kernels import STATES, run_cylinder
 from servoscope.simulation.faults import FaultEvent
 from servoscope.simulation.measurement import check_reference
-
-if TYPE_CHECKING:
-    from servoscope.signals import Recording
 
 REFERENCE_C = 45.0  # degC at which the rig's parameters hold
 SETTLING_S = 1.5  # for which the reference is held before the recording begins
@@ -196,9 +194,6 @@ def simulate_cylinder(
 
     Raises SimulationError if r or a fault does not fit.
     """
-    from servoscope.signals import Recording
-    from servoscope.simulation.cylinder_kernels import STATES, run_cylinder
-
     rig = CylinderRig() if rig is None else rig
     r = check_reference(r)
     if np.abs(r).max() >= 0.5 * rig.stroke:

@@ -8,21 +8,18 @@ before the chunk in front of its own.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
-from servoscope.core.jit import maximum, minimum, where
+from servoscope.core.jit import Int, maximum, minimum, where
 from servoscope.core.jit.array_function import ArrayFunction
 from servoscope.core.jit.arrays import Variable
 from servoscope.models.discretise import transition
+from servoscope.models.loop import Loop
 from servoscope.models.plants import Column, Plant
-
-if TYPE_CHECKING:
-    from servoscope.models.loop import Loop
-
 
 INTEGRAL, LAST_PLANT, HEADER_SIZE = 0, 1, 2  # places in the row; the plant's state follows the head
 
@@ -168,7 +165,7 @@ def advance_axis(
     drive = force.value
     push = drive - motion.stiffness[p] * at
     heading = where(v.is_equal(0.0), push, v) if order == 2 else push
-    d = where(heading >= 0.0, printer.whole(0), 1)
+    d = where(heading >= 0.0, Int(printer, "0"), 1)
     Phi, g = motion.Phi[p, d], motion.g[p, d]
     if order == 1:
         left = maximum(abs(push) - motion.coulomb[p], 0.0)

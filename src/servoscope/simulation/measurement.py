@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -11,14 +10,12 @@ import numpy.typing as npt
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
 from servoscope.models.discretise import split_delay
+from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
+from servoscope.signals import Recording
 from servoscope.simulation.faults import FaultEvent
+from servoscope.simulation.linear_kernels import ControllerConstants
 from servoscope.simulation.stability import controller_gains
-
-if TYPE_CHECKING:
-    from servoscope.models.loop import Loop
-    from servoscope.signals import Recording
-    from servoscope.simulation.linear_kernels import ControllerConstants
 
 NOISE_U_STD = 1e-4
 NOISE_Y_STD = float(np.sqrt(1e-7))
@@ -58,8 +55,6 @@ def draw_noise(samples: int, noise_u_std: float, noise_y_std: float, seed: int) 
 
 def make_recording(loop: Loop, r: FloatArray, u: FloatArray, y: FloatArray) -> Recording:
     """Return signals that begin at time 0 as a recording without defects."""
-    from servoscope.signals import Recording
-
     first = np.zeros(r.size, dtype=bool)
     first[0] = True
     return Recording(
@@ -76,8 +71,6 @@ def make_recording(loop: Loop, r: FloatArray, u: FloatArray, y: FloatArray) -> R
 
 def controller_constants(loop: Loop) -> ControllerConstants:
     """Return controller, limits, dead zone and delay of a loop as plain numbers."""
-    from servoscope.simulation.linear_kernels import ControllerConstants
-
     k_p, integral_gain = controller_gains(loop)
     low, high = loop.input_limits or (-np.inf, np.inf)
     deadzone = loop.input_deadzone or (np.inf, -np.inf)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,9 +12,12 @@ import numpy.typing as npt
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
 from servoscope.models.discretise import discretise
+from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant, StateSpace
 from servoscope.models.plants.eha import EHA
+from servoscope.signals import Recording
 from servoscope.simulation.faults import FaultEvent, PlantSchedule, describe_plants, resolve_faults, schedule_plants
+from servoscope.simulation.linear_kernels import HEADER_SIZE, ControllerConstants
 from servoscope.simulation.measurement import (
     NOISE_U_STD,
     NOISE_Y_STD,
@@ -25,13 +28,8 @@ from servoscope.simulation.measurement import (
     draw_noise,
     make_recording,
 )
+from servoscope.simulation.nonlinear_eha_kernels import run_rig
 from servoscope.simulation.stability import check_stable
-
-if TYPE_CHECKING:
-    from servoscope.models.loop import Loop
-    from servoscope.signals import Recording
-    from servoscope.simulation.linear_kernels import ControllerConstants
-    from servoscope.simulation.nonlinear_eha_kernels import RigConstants
 
 REFERENCE_C = 40.0  # degC at which the plant's parameters hold
 # largest rate times sub-step: on the reference rig y is then within 1e-5 m, a thirtieth of its noise
@@ -143,9 +141,6 @@ def simulate_rig(
     Raises SimulationError if the plant is no EHA, u is not held, or as for `simulate`; stability is judged without
     friction, at p_L = 0.
     """
-    from servoscope.simulation.linear_kernels import HEADER_SIZE
-    from servoscope.simulation.nonlinear_eha_kernels import run_rig
-
     rig = Rig() if rig is None else rig
     r = check_reference(r)
     plant = loop.plant
@@ -191,8 +186,6 @@ def nonlinear_run(loop: Loop, plants: Sequence[Plant], settings: ControllerConst
 
     Raises SimulationError if u is not held.
     """
-    from servoscope.simulation.nonlinear_eha_kernels import run_rig
-
     _check_hold(loop)
     actuators = [plant for plant in plants if isinstance(plant, EHA)]
     losses = [p.leakage_share * p.C_ie + p.K_c for p in actuators]
@@ -252,9 +245,8 @@ def _prepend_valve(system: StateSpace, rig: Rig) -> StateSpace:
     return whole, drive, np.hstack([C, np.zeros((1, 2))])
 
 
-def _rig_constants(plant: EHA, rig: Rig, loop: Loop, rows: FloatArray) -> RigConstants:
-    from servoscope.simulation.nonlinear_eha_kernels import RigConstants
-
+def _rig_constants(plant: EHA, rig: Rig, loop: Loop, rows: FloatArray) -> dict[str, Any]:
+    """Return what does not change during a recording, in plain numbers and SI units."""
     w = 0.0 if rig.valve_hz is None else 2.0 * np.pi * rig.valve_hz
     _, _, leakage, friction, stiffness = rows.T
     # rates of the modes that the sub-steps must follow: oil spring, leakage, friction (steepest at rest), valve
@@ -264,20 +256,20 @@ def _rig_constants(plant: EHA, rig: Rig, loop: Loop, rows: FloatArray) -> RigCon
     substeps = rig.substeps or max(4, int(np.ceil(fastest / (MAX_RATE_STEP * loop.sample_rate))))
     stroke = np.inf if rig.stroke is None else rig.stroke
     span = 0.2 if rig.stroke is None else rig.stroke
-    return RigConstants(
-        mobility=1.0 / plant.m_p,
-        stiffness=plant.k_p,
-        area=plant.A_p,
-        square_root=rig.load_pressure_flow,
-        area_ratio=plant.area_ratio,
-        coulomb=rig.coulomb,
-        breakaway=rig.static - rig.coulomb,
-        stribeck_speed=rig.stribeck_speed,
-        smooth_speed=rig.smooth_speed,
-        half_stroke=0.5 * stroke,
-        valve=w,
-        damping=rig.valve_damping,
-        resolution=0.0 if rig.sensor_bits is None else span / 2.0**rig.sensor_bits,
-        T=1.0 / loop.sample_rate,
-        substeps=substeps,
-    )
+    return {
+        "mobility": 1.0 / plant.m_p,  # there are no divisions in the innermost loop
+        "stiffness": plant.k_p,
+        "area": plant.A_p,
+        "square_root": rig.load_pressure_flow,
+        "area_ratio": plant.area_ratio,
+        "coulomb": rig.coulomb,
+        "breakaway": rig.static - rig.coulomb,  # static friction beyond Coulomb friction
+        "stribeck_speed": rig.stribeck_speed,
+        "smooth_speed": rig.smooth_speed,
+        "half_stroke": 0.5 * stroke,
+        "valve": w,  # 0: the spool follows at once
+        "damping": rig.valve_damping,
+        "resolution": 0.0 if rig.sensor_bits is None else span / 2.0**rig.sensor_bits,  # 0: continuous
+        "T": 1.0 / loop.sample_rate,
+        "substeps": substeps,
+    }

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -21,27 +22,7 @@ from servoscope.simulation.linear_kernels import (
 )
 
 
-class RigConstants(NamedTuple):
-    """What does not change during a recording, in plain numbers and SI units."""
-
-    mobility: float  # 1/m_p: there are no divisions in the innermost loop
-    stiffness: float
-    area: float
-    square_root: bool
-    area_ratio: float  # of the rod's side over the other
-    coulomb: float
-    breakaway: float  # static friction beyond Coulomb friction
-    stribeck_speed: float
-    smooth_speed: float
-    half_stroke: float
-    valve: float  # natural frequency in rad/s; 0: the spool follows at once
-    damping: float
-    resolution: float  # of the position sensor; 0: continuous
-    T: float
-    substeps: int
-
-
-def derivative(printer: Any, p: RigConstants, row: Any, drive: Any, x: Sequence[Any]) -> list[Any]:
+def derivative(printer: Any, p: Any, row: Any, drive: Any, x: Sequence[Any]) -> list[Any]:
     """Return the time derivative of x = [y, y', p_L, spool, spool'] under a held drive; row as in `run_rig`."""
     speed, pressure = x[1], x[2]
     has_valve = p.valve > 0.0
@@ -66,7 +47,7 @@ def derivative(printer: Any, p: RigConstants, row: Any, drive: Any, x: Sequence[
     ]
 
 
-def integrate_state(printer: Any, p: RigConstants, row: Any, x: Any, drive: Any, duration: Any) -> None:
+def integrate_state(printer: Any, p: Any, row: Any, x: Any, drive: Any, duration: Any) -> None:
     """Move the state x (5,) on under a held drive: Runge and Kutta's fourth order.
 
     A stop takes all momentum: beyond it the piston is put back and rests.
@@ -81,25 +62,27 @@ def integrate_state(printer: Any, p: RigConstants, row: Any, x: Any, drive: Any,
 
 
 def run_rig(
-    p: RigConstants, settings: ControllerConstants, rows: FloatArray, r: FloatArray, n_u: FloatArray,
+    rig: Mapping[str, Any], settings: ControllerConstants, rows: FloatArray, r: FloatArray, n_u: FloatArray,
     n_y: FloatArray, s: FloatArray, u: FloatArray, limited: FloatArray, acting: FloatArray, y: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
     """Run the closed loop of the rig, and carry s (HEAD + 5,) on: see `servoscope.simulation.linear_kernels`.
 
-    ``rows`` (N, 5) holds flow gain, 1/p_s, leakage, viscous friction and 1/capacity from each sample to the next; r,
-    n_u, n_y have shape (N,). Writes u, u after the limits, what acts on the valve before the delay (m + 2 + N,), and y;
-    returns y as measured, load pressure and spool, each (N,).
+    `rig` holds the constants of the rig by name; ``rows`` (N, 5) flow gain, 1/p_s, leakage, viscous friction and
+    1/capacity from each sample to the next; r, n_u, n_y have shape (N,). Writes u, u after the limits, what acts on the
+    valve before the delay (m + 2 + N,), and y; returns y as measured, load pressure and spool, each (N,).
     """
     measured, pressure, spool = np.empty((3, r.size))
-    _run_rig(p, settings, rows, r, n_u, n_y, s, u, limited, acting, y, measured, pressure, spool)
+    signals = rows, r, n_u, n_y, s, u, limited, acting, y, measured, pressure, spool
+    _run_rig(tuple(rig.values()), settings, *signals, names=tuple(rig))
     return measured, pressure, spool
 
 
 @ArrayFunction
 def _run_rig(
-    printer: Any, p: RigConstants, settings: ControllerConstants, rows: Any, r: Any, n_u: Any, n_y: Any, s: Any,
-    u: Any, limited: Any, acting: Any, y: Any, measured: Any, pressure: Any, spool: Any,
+    printer: Any, rig: Any, settings: ControllerConstants, rows: Any, r: Any, n_u: Any, n_y: Any, s: Any,
+    u: Any, limited: Any, acting: Any, y: Any, measured: Any, pressure: Any, spool: Any, *, names: tuple[str, ...],
 ) -> None:  # fmt: skip
+    p = SimpleNamespace(**dict(zip(names, rig, strict=True)))
     m, x, total = settings.delay_samples, Array.scratch(printer, "double", 5), Variable(printer, s[INTEGRAL])
     past, first = m + 2, settings.delay_fraction * p.T
     for i in range(5):

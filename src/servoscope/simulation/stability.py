@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.errors import SimulationError
 from servoscope.models.discretise import DiscretePlant, discretise
-
-if TYPE_CHECKING:
-    from servoscope.models.loop import Loop
-    from servoscope.models.plants import Plant
+from servoscope.models.loop import Loop
+from servoscope.models.plants import Plant
 
 
 def controller_gains(loop: Loop) -> tuple[float, float]:

@@ -1,9 +1,8 @@
-"""The door to machine code: arithmetic written once for every language, and loops that Numba compiles.
+"""The door to machine code: arithmetic written once for every language, and loops over arrays.
 
 *Traced* functions are straight-line arithmetic (`core.jit.symbolic`), run once with symbols. They become vector
 instructions (`core.jit.llvm_text`, `core.jit.native`), C (`core.jit.c_source`) or Structured Text
 (`core.jit.st_source`). Loops over arrays are traced in the same way (`core.jit.array_function`, `core.jit.arrays`).
-A *kernel* is a plain loop that Numba compiles on its first call (`core.jit.loops`): windows of features.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from __future__ import annotations
 from servoscope.core.jit.symbolic import (
     Bool,
     Float,
+    Int,
     dot,
     fma,
     maximum,
@@ -25,6 +25,7 @@ from servoscope.core.jit.symbolic import (
 __all__ = [
     "Bool",
     "Float",
+    "Int",
     "dot",
     "fma",
     "maximum",

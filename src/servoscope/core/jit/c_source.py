@@ -128,15 +128,13 @@ class CPrinter:
         """Write a number in another precision."""
         return self._assign(f"({target}){a}", target)
 
-    def compare(self, sign: str, kind: str, a: str, b: str) -> tuple[str, str]:
+    def compare(self, sign: str, kind: str, a: str, b: str) -> str:
         """Write a comparison, which does not hold where one of the two is NaN."""
-        return self._assign(f"{a} {sign} {b}", "i1"), "i1"
+        return self._assign(f"{a} {sign} {b}", "i1")
 
     def compare_whole(self, sign: str, a: str, b: str) -> str:
         """Write a comparison of whole numbers."""
         return self._assign(f"{a} {self.OPERATORS.get(sign, sign)} {b}", "i1")
-
-    combine = operate
 
     def select(self, condition_kind: str, condition: str, kind: str, a: str, b: str) -> str:
         """Write a where the condition holds, b where not."""
@@ -147,10 +145,6 @@ class CPrinter:
         text = self.CALLS[name].format(*arguments)
         return self._assign(text.replace(f"{name}(", f"{name}f(") if kind == "float" else text, kind)
 
-    def number_kind(self, condition_kind: str) -> str:
-        """Return the type of numbers that a condition chooses from, where nothing else is said."""
-        return "double"
-
     def truncate(self, number: Float) -> Int:
         """Return a number without what follows its point."""
         return Int(self, self._assign(f"(int){number.text}", "i64"))
@@ -158,10 +152,6 @@ class CPrinter:
     def number(self, whole: Int) -> Float:
         """Return a whole number as a number."""
         return Float(self, self._assign(f"(double){whole}", "double"), "double")
-
-    def whole(self, number: int) -> Int:
-        """Return a constant whole number."""
-        return Int(self, str(number))
 
     # places, loops and branches
 

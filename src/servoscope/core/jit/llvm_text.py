@@ -39,12 +39,6 @@ def _split(kind: str) -> tuple[str, int]:
 
 
 @functools.cache
-def _like(kind: str, element: str) -> str:
-    """Return the type of as many other elements."""
-    return vector(element, _split(kind)[1])
-
-
-@functools.cache
 def _constant(number: float, kind: str) -> str:
     element, lanes = _split(kind)
     if element == "float":
@@ -109,7 +103,7 @@ class LlvmPrinter:
         return _constant(number, kind)
 
     def operate(self, name: str, kind: str, a: str, b: str) -> str:
-        """Write an operation on two numbers."""
+        """Write an operation on two numbers, or conditions."""
         return self.assign(f"{name} {kind} {a}, {b}")
 
     def negate(self, kind: str, a: str) -> str:
@@ -121,17 +115,13 @@ class LlvmPrinter:
         word = "fpext" if _split(target)[0] == "double" else "fptrunc"
         return self.assign(f"{word} {kind} {a} to {target}")
 
-    def compare(self, sign: str, kind: str, a: str, b: str) -> tuple[str, str]:
-        """Write a comparison, which does not hold where one of the two is NaN; return it and its type."""
-        return self.assign(f"fcmp o{COMPARISONS[sign]} {kind} {a}, {b}"), _like(kind, "i1")
+    def compare(self, sign: str, kind: str, a: str, b: str) -> str:
+        """Write a comparison, which does not hold where one of the two is NaN."""
+        return self.assign(f"fcmp o{COMPARISONS[sign]} {kind} {a}, {b}")
 
     def compare_whole(self, sign: str, a: str, b: str) -> str:
         """Write a comparison of whole numbers."""
         return self.assign(f"icmp {'s' * (sign != '==')}{COMPARISONS[sign]} i64 {a}, {b}")
-
-    def combine(self, name: str, kind: str, a: str, b: str) -> str:
-        """Write that both conditions hold, or one of them."""
-        return self.assign(f"{name} {kind} {a}, {b}")
 
     def select(self, condition_kind: str, condition: str, kind: str, a: str, b: str) -> str:
         """Write a where the condition holds, b where not."""
@@ -149,10 +139,6 @@ class LlvmPrinter:
         """Write a call of a function of C's library."""
         self._declarations.add(f"declare double @{name}(double)")
         return Float(self, self.assign(f"call double @{name}(double {number.text})"), "double")
-
-    def number_kind(self, condition_kind: str) -> str:
-        """Return the type of numbers in double precision that a condition chooses from."""
-        return _like(condition_kind, "double")
 
     # conditions and lanes
 
@@ -233,10 +219,6 @@ class LlvmPrinter:
     def number(self, whole: Int) -> Float:
         """Return a whole number as a number."""
         return Float(self, self.assign(f"sitofp i64 {whole} to double"), "double")
-
-    def whole(self, number: int) -> Int:
-        """Return a constant whole number."""
-        return Int(self, str(number))
 
     def stack(self, element: str, size: int) -> str:
         """Return the place of numbers of this call, not filled."""

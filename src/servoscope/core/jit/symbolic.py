@@ -25,10 +25,10 @@ class Bool:
     kind: str
 
     def __and__(self, other: Bool) -> Bool:
-        return Bool(self.printer, self.printer.combine("and", self.kind, self.text, other.text), self.kind)
+        return Bool(self.printer, self.printer.operate("and", self.kind, self.text, other.text), self.kind)
 
     def __or__(self, other: Bool) -> Bool:
-        return Bool(self.printer, self.printer.combine("or", self.kind, self.text, other.text), self.kind)
+        return Bool(self.printer, self.printer.operate("or", self.kind, self.text, other.text), self.kind)
 
     def __invert__(self) -> Bool:
         return Bool(self.printer, self.printer.opposite(self.kind, self.text), self.kind)
@@ -46,7 +46,8 @@ def _binary(name: str, *, reflected: bool = False) -> Callable[[Float, Any], Flo
 
 def _comparison(sign: str) -> Callable[[Float, Any], Bool]:
     def compare(self: Float, other: Any) -> Bool:
-        return Bool(self.printer, *self.printer.compare(sign, self.kind, self.text, self.to_operand(other)))
+        kind = self.kind.replace("double", "i1").replace("float", "i1")
+        return Bool(self.printer, self.printer.compare(sign, self.kind, self.text, self.to_operand(other)), kind)
 
     return compare
 
@@ -286,7 +287,7 @@ def where(condition: Any, a: Any, b: Any) -> Any:
     if isinstance(symbol, Int):
         return Int(printer, printer.select(condition.kind, condition.text, "i64", str(a), str(b)))
     if symbol is None:
-        symbol = Float(printer, "", printer.number_kind(condition.kind))
+        symbol = Float(printer, "", condition.kind.replace("i1", "double"))
     operands = symbol.to_operand(a), symbol.to_operand(b)
     return Float(printer, printer.select(condition.kind, condition.text, symbol.kind, *operands), symbol.kind)
 

@@ -28,9 +28,13 @@ def update(
 
     Source: Stenlund and Gustafsson (2002); Medvedev (2003). At phi = 0 nothing moves: no covariance windup.
     """
-    g, g_d = ([sum_products(row, phi) for row in matrix] for matrix in (P, P_d))
-    e = sum_products([-x for x in phi], theta, eta)
-    denominator, denominator_d = sum_products(phi, g, R), sum_products(phi, g_d, R)
+    return step_along(phi, theta, P, P_d, R, sum_products([-x for x in phi], theta, eta))
+
+
+def step_along(z: Numbers, theta: Numbers, P: Matrix, P_d: Matrix, R: Any, e: Any) -> Update:
+    """Return the update by a residual e along z: phi, or the instrument in its place."""
+    g, g_d = ([sum_products(row, z) for row in matrix] for matrix in (P, P_d))
+    denominator, denominator_d = sum_products(z, g, R), sum_products(z, g_d, R)
     K = [x / denominator for x in g]
     return Update(
         [x + gain * e for x, gain in zip(theta, K, strict=True)],

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from servoscope.core.jit import sum_products, where
-from servoscope.estimation.update import Matrix, Numbers, Update, symmetric
+from servoscope.estimation.estimators.akf import step_along
+from servoscope.estimation.update import Matrix, Numbers, Update
 
 NAME = "iv-akf"
 NEEDS_INSTRUMENT = True
@@ -20,15 +21,8 @@ def update(
     phi' P z would be to choose them by their noise, which is a bias. A residual out of all proportion is refused
     (status 1).
     """
-    g, g_d = ([sum_products(row, z) for row in matrix] for matrix in (P, P_d))
     e = sum_products([-x for x in phi], theta, eta)
-    denominator, denominator_d = sum_products(z, g, R), sum_products(z, g_d, R)
-    K = [x / denominator for x in g]
-    new = Update(
-        [x + gain * e for x, gain in zip(theta, K, strict=True)],
-        symmetric(lambda i, j: P[i][j] + (g_d[i] * g_d[j] / denominator_d - g[i] * g[j] / denominator), len(theta)),
-        K,
-    )
+    new = step_along(z, theta, P, P_d, R, e)
     # no signal reaches this: where z points away from phi, theta would grow until it overflows
     refused = e * e > 1e12 * R
     return new.where(e * e <= 1e12 * R, theta, P, where(refused, 1.0, 0.0))

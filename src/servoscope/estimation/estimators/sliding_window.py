@@ -6,8 +6,8 @@ import math
 import sys
 from typing import Any
 
-from servoscope.core.jit import Bool, maximum, minimum, sqrt, sum_products, where
-from servoscope.estimation.update import Matrix, Numbers, Update, symmetric
+from servoscope.core.jit import Bool, Int, maximum, minimum, sqrt, sum_products, where
+from servoscope.estimation.update import Matrix, Numbers, Update, symmetric, write_matrix
 
 NAME = "sliding-window"
 NEEDS_INSTRUMENT = False
@@ -107,40 +107,36 @@ def update(
     """
     p, n = extra.printer, len(theta)
     size = n * (n + 3) // 2
-    start, N = p.whole(0), maximum(p.truncate(memory + 0.5), 1)
+    start, N = Int(p, "0"), maximum(p.truncate(memory + 0.5), 1)
 
     def read_factor(at: Any) -> Matrix:
         numbers = [extra[at + k] for k in range(size)]
         return [[numbers.pop(0) for _ in range(n + 1 - i)] for i in range(n)]
 
-    def store_factor(F: Matrix, at: Any) -> None:
-        for k, number in enumerate(number for row in F for number in row):
-            extra[at + k] = number
-
     with p.when(extra[start] <= 0.0):  # slot j holds the share 1 - j/N of what is known before
         prior = prior_factor(theta, P, R)
         for j in p.loop(0, N):
             share = sqrt(p.number(N - j) / p.number(N))
-            store_factor([[x * share for x in row] for row in prior], j * size + (1 + size))
+            write_matrix(extra, [[x * share for x in row] for row in prior], j * size + (1 + size))
         extra[start] = 1.0
     k = p.truncate(extra[start]) - 1  # samples in the running block
     for i, number in enumerate((*phi, eta)):
         extra[k * size + (1 + size + i)] = number
     running = rotate_row(read_factor(start + 1), [*phi, eta])
-    store_factor(running, start + 1)
+    write_matrix(extra, running, start + 1)
     goes_on = k + 1 < N
     joined = running
     for i, row in enumerate(read_factor(minimum(k + 1, N - 1) * size + (1 + size))):
         joined = rotate_row(joined, [*([0.0 * R] * i), *(where(goes_on, x, 0.0) for x in row)], i)
     extra[start] = p.number(k + 2)
     with p.when(k + 1 >= N):
-        store_factor([[0.0 * x for x in row] for row in running], start + 1)
+        write_matrix(extra, [[0.0 * x for x in row] for row in running], start + 1)
         for i in p.loop(0, N):
             at = (N - 1 - i) * size + (1 + size)
             factor = rotate_row(read_factor(start + 1), [extra[at + j] for j in range(n + 1)])
-            store_factor(factor, start + 1)
-            store_factor(factor, at)
-        store_factor([[0.0 * x for x in row] for row in running], start + 1)
+            write_matrix(extra, factor, start + 1)
+            write_matrix(extra, factor, at)
+        write_matrix(extra, [[0.0 * x for x in row] for row in running], start + 1)
         extra[start] = 1.0
     w, S, valid = solve_factor(joined)
     G = symmetric(lambda i, j: sum_products(S[i][i:], S[j][i:]), n)

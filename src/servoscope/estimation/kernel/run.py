@@ -297,7 +297,7 @@ def run_blocks(p: LlvmPrinter, spec: KernelSpec, lanes: int, element: str, own: 
 
 def run_sample(p: LlvmPrinter, spec: KernelSpec, lanes: int, element: str, own: bool) -> None:
     """Write one sample of one asset, in place; the result says whether an evaluation is due."""
-    block, size, zero = LaneBlock(p, spec, 1, element), spec.sizes, p.whole(0)
+    block, size, zero = LaneBlock(p, spec, 1, element), spec.sizes, Int(p, "0")
     c, state = Memory(p, "%constants", element), Memory(p, "%state", "double")
 
     def whole(memory: Memory, row: int) -> Int:
@@ -329,7 +329,7 @@ def write_regressors(p: LlvmPrinter, spec: KernelSpec, lanes: int, element: str,
 
     The state is carried on in place.
     """
-    block, size, zero = LaneBlock(p, spec, 1, element), spec.sizes, p.whole(0)
+    block, size, zero = LaneBlock(p, spec, 1, element), spec.sizes, Int(p, "0")
     c, samples, stride = Memory(p, "%constants", element), p.argument("samples"), p.argument("stride")
     block.unpack("%state", [zero])
     number = p.truncate(Float(p, block.h.load(SAMPLE), "double"))

@@ -14,7 +14,6 @@ class KernelSizes(NamedTuple):
 
     n: int
     rows: int
-    inputs: int
     states: int
     speed: int
     gated: bool

@@ -18,6 +18,7 @@ from servoscope.estimation.axis_filter import NO_LAG, AxisFilter, AxisSignals, D
 from servoscope.estimation.noise_model import sample_autocovariance
 from servoscope.fit.kernels import Array
 from servoscope.fit.plant_experiment import plant_input
+from servoscope.isolation.ml.least_squares import orthonormal_basis
 from servoscope.isolation.ml.window import (
     SENSOR_GAIN,
     ChangeProfile,
@@ -212,8 +213,6 @@ class AxisWindow(ChangeWindow):
         """
         if not sizes:
             return 1.0
-        from servoscope.isolation.ml.least_squares import orthonormal_basis
-
         J, N, lags = jacobian, self.samples, self.coloured
         Q = orthonormal_basis(J[:, :-sizes])
         own = J[:, -sizes:] - Q @ (Q.T @ J[:, -sizes:])

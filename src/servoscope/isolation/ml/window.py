@@ -16,6 +16,7 @@ from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.fit.kernels import Array
 from servoscope.fit.plant_experiment import plant_input
 from servoscope.fit.predictor import PlantVariants, Predictor, PredictorFactory
+from servoscope.isolation.ml.onset_sums import prepare_sums
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
@@ -259,8 +260,6 @@ class RefitWindow(ChangeWindow):
 
     def change_sums(self, d: FloatArray, names: Sequence[str], x: FloatArray, step: float, Q: FloatArray) -> ChangeSums:
         """Prepare the sums of products by onset: one pass over the window, in which every predictor settles anew."""
-        from servoscope.isolation.ml.onset_sums import prepare_sums
-
         moved = np.vstack([np.zeros(len(x)), step * np.eye(len(x))])
         variants = self.variants(np.column_stack([np.tile(d, (len(moved), 1)), x + moved]), names, DRIFT)
         return prepare_sums(variants, step, self.u, self.y, self.restart, Q)

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray
-from servoscope.estimation.filter_bank import filter_cutoff
 from servoscope.estimation.noise_model import WhiteNoise, largest_autocorrelation
 from servoscope.fit.plant_experiment import LAGS, MAX_SAMPLES, PlantExperiment, robust_covariance
 from servoscope.fit.search import MAX_STEPS, Fit, fit
@@ -88,7 +87,7 @@ def _initial_plant(loop: Loop, regressors: Regressors | None) -> tuple[Plant, fl
     if regressors is None or "coefficients" not in type(plant).model_fields:
         return None
     g = regressors
-    block = settling_samples(filter_cutoff(loop), g.bank.n, 1.0 / loop.sample_rate)
+    block = settling_samples(loop.cutoff, g.bank.n, 1.0 / loop.sample_rate)
     fit = fit_regression(g.bank.names, g.eta, g.phi, g.ok, block)
     if fit is None:
         return None

@@ -12,7 +12,6 @@ from pydantic import PrivateAttr
 from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.core.messages import Message, MessageText, message
 from servoscope.core.short_repr import ShortRepr
-from servoscope.estimation.filter_bank import filter_cutoff
 from servoscope.estimation.reference_period import reference_period
 from servoscope.learning.inspection import delay, excitation, model_order, signals, simulation_fit
 from servoscope.learning.inspection import residual as leftover
@@ -174,7 +173,7 @@ def _measure_with_model(
     noise = signals.white_noise_std(recording.y, recording.restart, m.quantisation[2].step)
     band = excitation.usable_band(spectra) if spectra is not None else None
     suggested = _suggested_cutoff(spectra, band.high_hz if band else None, noise, rate)
-    cutoff = filter_cutoff(loop) if loop is not None else suggested
+    cutoff = loop.cutoff if loop is not None else suggested
     # Variance of white noise behind a second-order differentiator, and behind the filter's own s F(s).
     sign_rate = 2.0 * math.pi * min(model_order.FAST_SIGN, rate / 4.0)
     own_rate = 2.0 * math.pi * cutoff

@@ -9,7 +9,9 @@ import numpy as np
 from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.estimation import filter_bank
 from servoscope.estimation.filter_bank import FilterBank
+from servoscope.estimation.kernel.sample_steps import USED
 from servoscope.estimation.pipeline import Pipeline
+from servoscope.estimation.recursion import Recursion
 from servoscope.estimation.tuning import sandwich_covariance
 from servoscope.learning.inspection.signals import InspectionModel
 from servoscope.models.loop import Loop, MonitorSettings
@@ -77,9 +79,6 @@ def generic_loop(rate: float, cutoff: float, sign_speed: float = 0.0) -> Loop:
 
 def form_regressors(recording: Recording, loop: Loop, delay: float | None = None) -> Regressors:
     """Form eta and phi with the state-variable filter, whatever structure and estimator the loop asks for."""
-    from servoscope.estimation.kernel.sample_steps import USED
-    from servoscope.estimation.recursion import Recursion
-
     monitor = loop.monitor.model_copy(update={"structure": "svf", "update_when": "always"})
     loop = loop.model_copy(update={"monitor": monitor, "delay": loop.delay if delay is None else delay})
     bank = filter_bank.build_filter_bank(loop)

@@ -1,0 +1,1 @@
+"""What runs how fast: each module measures one thing, and says so in its first line."""
