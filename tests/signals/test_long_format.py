@@ -81,7 +81,8 @@ def test_a_database_of_several_tables_is_read_table_by_table(tmp_path: Path) -> 
             database.executemany(f"INSERT INTO {table} VALUES (?, ?, ?, ?)", values)
     columns = Columns(time="axis.t", reference="axis.r", input="axis.u", output="axis.y")
     as_expected(read(tmp_path / "x.db", columns=columns))
-    assert "different tables" in refusal(tmp_path / "x.db", columns=columns.model_copy(update={"output": "other.y"}))
+    apart = columns.model_copy(update={"output": "other.y"})
+    assert "'other.y' was not sampled together with axis.r" in refusal(tmp_path / "x.db", columns=apart)
 
 
 def test_a_bag_without_definitions_says_how_to_convert_it(tmp_path: Path) -> None:

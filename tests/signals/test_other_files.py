@@ -28,7 +28,7 @@ SUFFIXES = {
 }
 # in this process, so that nothing but the reader itself keeps them from the other file
 OPENERS: dict[str, Callable[[Path], Any]] = {
-    "MAT 7.3": mat.open_mat_objects,
+    "MAT 7.3": mat.open_mat,
     "HDF5": mat.open_hdf5,
     "MDF": mdf_tdms.open_mdf,
     "TDMS": mdf_tdms.open_tdms,

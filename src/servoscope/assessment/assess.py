@@ -167,8 +167,8 @@ def assess(log: Samples | Source, *, name: str | None = None, travel: tuple[floa
             return _conclude(facts, {c: float(c == cause) for c in CAUSES}, signals, travel)
     factor = -(-t.size // MAX_ROWS)
     if factor > 1:
-        t, u, y = (_means(x, factor) for x in (t, u, y))
-        r = _means(r, factor) if r is not None else None
+        t, u, y = (thin(x, factor) for x in (t, u, y))
+        r = None if r is None else thin(r, factor)
         signals = AssessedSignals(t, r, u, y, None)
     analysis = analyse(r, u, y)
     signals = AssessedSignals(t, r, u, y, analysis)
@@ -190,10 +190,6 @@ def _follows_reference(analysis: Analysis, r: FloatArray) -> bool:
     error = analysis.oscillation.band
     left = error - rows @ np.linalg.lstsq(rows, error, rcond=None)[0]
     return bool(left @ left < (1.0 - MIN_REFERENCE_SHARE) * (error @ error))
-
-
-def _means(x: FloatArray, factor: int) -> FloatArray:
-    return np.asarray(x[: x.size // factor * factor].reshape(-1, factor).mean(axis=1))
 
 
 def equidistant(log: Samples, name: str) -> tuple[FloatArray, FloatArray | None, FloatArray, FloatArray, float]:

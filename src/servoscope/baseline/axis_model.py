@@ -6,19 +6,18 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from servoscope.baseline.covariates import CovariateModel
+from servoscope.baseline.records import BaselineModel, Matrix
 from servoscope.core.arrays import FloatArray
 from servoscope.estimation.axis_filter import NO_LAG, AxisNoise, DriveLag
 from servoscope.models.plants import Fault
 from servoscope.models.plants.axis import BY_DIRECTION, FRICTION, FRICTION_FAULT, AxisPlant
 
 
-class AxisMoves(BaseModel):
+class AxisMoves(BaselineModel):
     """How covariates move the coefficients of an axis along a recording."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     covariates: CovariateModel
     names: tuple[str, ...]  # of the coefficients that its slopes are about
@@ -30,14 +29,12 @@ class AxisMoves(BaseModel):
         return np.array([1.0 / inertia, *(along[column.coefficient] / inertia for column in plant.acting)])
 
 
-class AxisModel(BaseModel):
+class AxisModel(BaselineModel):
     """A healthy motor axis with friction, in the unit of ``input_gain u``."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     coefficients: dict[str, float]  # all of the plant's
     parameters: tuple[str, ...]  # those of which the logarithm is known with `covariance` (m, m), between recordings
-    covariance: tuple[tuple[float, ...], ...]
+    covariance: Matrix
     noise: AxisNoise
     # how late the force follows u, beyond the delay of the loop file
     drive: Annotated[DriveLag, Field(exclude_if=lambda drive: not any(drive))] = NO_LAG
@@ -46,7 +43,7 @@ class AxisModel(BaseModel):
     offset_std: float  # how far the constant force of a recording may be from that of the others
     drift_std: float  # and how much it may change within one
     # coefficients that the healthy recordings do not show, and how far one recording's estimate may be from them
-    unseen: dict[str, float] = {}
+    unseen: dict[str, float] = Field(default={})
     # what twice the log-likelihood ratio of a change within a recording has to exceed, where healthy ones exceed what
     # chance explains; 0 where they do not
     change_limit: float = 0.0

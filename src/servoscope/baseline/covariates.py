@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from servoscope.baseline.records import BaselineModel, Matrix, Vector
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.messages import Message, message
 from servoscope.models.lfilter import lfilter
@@ -17,17 +18,15 @@ from servoscope.models.lfilter import lfilter
 EDGE_SHARE = 0.2  # share of the learned range, by which a covariate may be outside of it, where slopes are less certain
 
 
-class WarmUp(BaseModel):
+class WarmUp(BaselineModel):
     """What healthy recordings say of a warm-up that is not measured; see `servoscope.detection.warm_up`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     time_constant_s: float
     power: float  # mean of u y'; 0 where there is none
     variance: float  # of what is left of eta, as sums over blocks of time show it
 
 
-class CovariateModel(BaseModel):
+class CovariateModel(BaselineModel):
     """How n coefficients move with k covariates c, from their values theta_0 where x = (c - origin)/half_range is 0.
 
     ::
@@ -37,15 +36,13 @@ class CovariateModel(BaseModel):
     with the powers of each x up to its `degrees` as basis, p of them, and B (p, n) known with `covariance`.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
     names: tuple[str, ...]
-    low: tuple[float, ...]  # low, high: the range that the healthy recordings hold
-    high: tuple[float, ...]
+    low: Vector  # low, high: the range that the healthy recordings hold
+    high: Vector
     degrees: tuple[int, ...]
     proportional: tuple[bool, ...]
-    slopes: tuple[tuple[float, ...], ...]  # B (p, n)
-    covariance: tuple[tuple[float, ...], ...]  # of B by rows, (p n, p n)
+    slopes: Matrix  # B (p, n)
+    covariance: Matrix  # of B by rows, (p n, p n)
     # where the one covariate is no column but a warm-up that the coefficients tell
     warm_up: WarmUp | None = Field(default=None, exclude_if=lambda value: value is None)
 
@@ -76,15 +73,22 @@ class CovariateModel(BaseModel):
         values = self.clip(CovariatePath.of(self, np.zeros(len(self.proportional)), channels, 1.0).values)
         return np.asarray(np.where(self.proportional, np.exp(self.basis(values) @ np.array(self.slopes)), 1.0))
 
-    def theta_covariance(self, theta: FloatArray, c: FloatArray) -> FloatArray:
-        """Return what the uncertain slopes make of the coefficients at covariates (..., k), shape (..., n, n)."""
+    def theta_covariance(self, theta: FloatArray, c: FloatArray, std: FloatArray | None = None) -> FloatArray:
+        """Return what the uncertain slopes make of the coefficients at covariates (..., k), shape (..., n, n).
+
+        `std` (..., 1): standard deviation of the one covariate, where it is not measured.
+        """
         G, n = self.basis(c), len(theta)
         C = np.array(self.covariance).reshape(G.shape[-1], n, G.shape[-1], n)
         size = np.where(self.proportional, self.theta(theta, c), 1.0)
         # few products of whole arrays: einsum of three takes ten times as long
         pairs = itertools.product(range(G.shape[-1]), repeat=2)
         spread = sum(((G[..., p, None, None] * C[p, :, q]) * G[..., q, None, None] for p, q in pairs), np.float64(0.0))
-        return np.asarray(spread * size[..., :, None] * size[..., None, :])
+        spread = np.asarray(spread * size[..., :, None] * size[..., None, :])
+        if std is not None:
+            off = self.theta(theta, c + std) - self.theta(theta, c)
+            spread = spread + off[..., :, None] * off[..., None, :]
+        return spread
 
     def clip(self, c: FloatArray) -> FloatArray:
         """Return covariates (..., k) held where something is known: within the learned range, or next to it."""
@@ -227,9 +231,5 @@ class CovariatePath:
 
     def covariance(self, samples: IntArray) -> FloatArray:
         """Return what is not known of them, shape (K, n, n)."""
-        c = self.averages[samples]
-        slopes = self.model.theta_covariance(self.theta, c)
-        if self.std is None:
-            return slopes
-        off = self.model.theta(self.theta, c + self.std[samples, None]) - self.model.theta(self.theta, c)
-        return slopes + off[:, :, None] * off[:, None, :]
+        std = None if self.std is None else self.std[samples, None]
+        return self.model.theta_covariance(self.theta, self.averages[samples], std)

@@ -24,29 +24,22 @@ from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from servoscope.baseline.covariates import EDGE_SHARE
 from servoscope.baseline.feature_spans import NO_COVARIATES, SpanFeatures
+from servoscope.baseline.records import BaselineModel, Matrix, Vector
 from servoscope.baseline.threshold import FEATURE_SHARE, SECONDS_PER_YEAR
 from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.estimation.window_features import MOTIONS, SIGNALS, FeatureLayout, Window
 
 PRIOR_DEGREES = 30.0  # degrees of freedom of the shape of S_w behind S
 SCORE_POWER = 4.0  # in which the scores of groups are averaged
-# of the learned range, by which a covariate may be outside of it: the limit widens with the distance
-MAX_EXTRAPOLATION_SHARE = 0.2
 WIDENING_SHARE = 0.5  # share by which the healthy range of motion is widened either way
 MIN_WIDENING = 0.05  # and by how much at least: of a share of time, of a logarithm of speed
 
-Vector = tuple[float, ...]
-Matrix = tuple[Vector, ...]
 
-
-class _FeatureRecord(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class FeatureGroup(_FeatureRecord):
+class FeatureGroup(BaselineModel):
     """Features that belong together, at one length of windows, of n healthy recordings."""
 
     level: int
@@ -66,7 +59,7 @@ class FeatureGroup(_FeatureRecord):
         return values[self.level, list(self.kept)], float(counts[self.level])
 
 
-class FeatureModel(_FeatureRecord):
+class FeatureModel(BaselineModel):
     """The features of healthy recordings; everything that compares another recording with them."""
 
     layout: FeatureLayout
@@ -257,7 +250,7 @@ class GroupStatistic(NamedTuple):
 
 def is_near(learned: FloatArray, covariates: FloatArray) -> bool:
     """Return whether covariates (k,) are within the range of learned ones (n, k), or next to it."""
-    edge = MAX_EXTRAPOLATION_SHARE * np.ptp(learned, axis=0)
+    edge = EDGE_SHARE * np.ptp(learned, axis=0)  # beyond the range, the limit widens with the distance
     return bool(((covariates >= learned.min(axis=0) - edge) & (covariates <= learned.max(axis=0) + edge)).all())
 
 

@@ -5,24 +5,24 @@ from __future__ import annotations
 from typing import Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import model_validator
+
+from servoscope.baseline.records import BaselineModel, Matrix, Vector
 
 SEVERITY = "severity"  # the parameter of a fault that was learned from labelled recordings
 
 
-class LearnedFault(BaseModel):
+class LearnedFault(BaselineModel):
     """What a baseline knows of a fault from labelled recordings of it."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
     name: str
-    deviation: tuple[float, ...]  # by how much theta differs from healthy at the labelled severity, shape (n,)
+    deviation: Vector  # by how much theta differs from healthy at the labelled severity, shape (n,)
     # of the deviation of a further recording of that severity around it, the noise of its own estimate aside: noise
     # of the labelled recordings, and what they differ by beside their severity, shape (n, n)
-    covariance: tuple[tuple[float, ...], ...]
+    covariance: Matrix
     # recordings, shares: names of the labelled recordings, and the severity of each relative to their mean
     recordings: tuple[str, ...]
-    shares: tuple[float, ...]
+    shares: Vector
 
     @model_validator(mode="after")
     def _check_consistency(self) -> Self:

@@ -11,14 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
+from servoscope.baseline.records import BaselineModel, Matrix
 from servoscope.core import outofcore
 from servoscope.core.arrays import BoolArray, FloatArray, to_tuples
 from servoscope.estimation.pipeline import Pipeline, RegressionRunner, Tuning
 from servoscope.signals import Recording
-
-__all__ = ["QUANTITIES", "MotionRange", "RecordedMotion", "learn_motion"]
 
 QUANTITIES = ("amplitude", "speed", "acceleration", "frequency")
 # of the windows in memories: the last ones, which the estimate remembers, and those around, which vary less
@@ -32,21 +30,17 @@ AT_ONCE = 8192  # evaluations that are compared together
 SIGNALS = 2  # r and y
 MOMENTS = 3  # mean squares of position, speed and acceleration
 
-Ranges = tuple[tuple[tuple[float, ...], ...], ...]
 
-
-class MotionRange(BaseModel):
+class MotionRange(BaselineModel):
     """The motion of the healthy recordings: what root mean squares over windows of `WINDOWS` were between.
 
     `least`, `most`: window by window, of r and of y, the `QUANTITIES`: distance from `origin`, speed, acceleration, and
     acceleration over speed as a frequency [Hz].
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
     origin: float  # mean of y
-    least: Ranges
-    most: Ranges
+    least: tuple[Matrix, ...]
+    most: tuple[Matrix, ...]
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,23 +12,14 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
+from servoscope.baseline.records import BaselineModel, Vector
+from servoscope.baseline.threshold import SECONDS_PER_YEAR
 from servoscope.core.arrays import FloatArray, IntArray
 from servoscope.core.errors import NotEnoughError
 from servoscope.core.messages import Message, message
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
-
-__all__ = [
-    "SensorDeviation",
-    "SensorKind",
-    "SensorModel",
-    "find_sensor_deviation",
-    "learn_sensors",
-    "sensor_values",
-    "without_sensor",
-]
 
 SensorKind = Literal["fixed", "gain", "offset", "noise"]
 
@@ -37,16 +28,11 @@ LIMIT_MARGIN = 1.5  # times the largest CUSUM of the healthy recordings: slow di
 REPEATS = 5  # equal values in a row from which a sensor stands still, where no healthy one repeats any
 MIN_EXPLAINED_SHARE = 0.5  # share of the squared disagreement from which an offset or a gain explains it
 MIN_BLOCKS = 20  # of healthy recordings
-YEAR_S = 365.25 * 86400.0
 MIN_NOISE_SHARE = 1e-6  # of the sensors' rms: the least noise, for sensors that are copies of each other
 
-Vector = tuple[float, ...]
 
-
-class SensorModel(BaseModel):
+class SensorModel(BaselineModel):
     """How the sensors of one output disagree while all are healthy, one value per sensor."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     names: tuple[str, ...]
     samples: int  # per block
@@ -245,7 +231,7 @@ def _repeats(x: FloatArray) -> IntArray:
 def _cusum_limit(loop: Loop, sensors: int) -> float:
     """Return the limit at which white noise alarms as often as the budget allows, after Siegmund (1985)."""
     rate = loop.monitor.evaluation_rate
-    blocks = YEAR_S * rate / loop.monitor.false_alarms_per_year * 3.0 * sensors
+    blocks = SECONDS_PER_YEAR * rate / loop.monitor.false_alarms_per_year * 3.0 * sensors
     return math.log(2.0 * ALLOWANCE**2 * blocks) / (2.0 * ALLOWANCE) - 1.166
 
 

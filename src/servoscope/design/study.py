@@ -33,7 +33,7 @@ from servoscope.design.scenario import Scenario, require_exact_predictor, requir
 from servoscope.detection.statistic import required_noncentrality
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.isolation.ml.search import BEFORE_S
-from servoscope.learning.detectability import MIN_MEMORIES
+from servoscope.learning.inspection.rules import MIN_MEMORIES
 from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Fault

@@ -110,11 +110,8 @@ class CovariateMonitor:
         averages, std = np.split(averages, [len(self.model.names)], axis=1)
         known = np.isfinite(averages).all(axis=1) & self.model.is_inside(averages)
         c = np.where(known[:, None], self.model.clip(averages), self.model.origin)
-        theta, spread = self.model.theta(self._theta, c), self.model.theta_covariance(self._theta, c)
-        if std.size:
-            off = self.model.theta(self._theta, c + np.where(known[:, None], std, 0.0)) - theta
-            spread = spread + off[:, :, None] * off[:, None, :]
-        return theta - self._theta, spread, known
+        spread = self.model.theta_covariance(self._theta, c, np.where(known[:, None], std, 0.0) if std.size else None)
+        return self.model.theta(self._theta, c) - self._theta, spread, known
 
     def compare(self, trace: Trace, averages: FloatArray) -> Trace:
         """Return evaluations compared with what is healthy at averages of the covariates, as `expect` takes them.

@@ -20,7 +20,6 @@ MIN_LOG_LIKELIHOOD_GAIN = 100.0  # of two variances against one; differences of 
 MIN_NOISE_GROWTH = 1.5  # of the variance of the residual; below it counts as none
 MIN_OWN_GROWTH = 1.5  # of that of the whole signal: one that is scaled is another unit or gain
 MAX_SAMPLES = 2_000_000  # of a recording, which is looked at as a whole
-MIN_NOISE_GROWTH = 1.5  # of the variance of the residual; below it counts as none
 MAX_STDS = 4.0  # by which a step of u or an outlier counts
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -161,8 +160,7 @@ def _judge_signals(
         raise RecordingError(f"{recording.name}: {missing}")
     exams = [Examination.from_recording(at_point, recording) for at_point in points]
     if (unusable := next(findings(exams[0], "undetermined"), None)) is not None:
-        change = _feature_change(exams[0]) if unusable.kind == "outside" else {}
-        return leave_undetermined(exams[0], unusable.text).model_copy(update=change), exams[0], None
+        return leave_undetermined(exams[0], unusable.text), exams[0], None
     if (own := next(filter(None, map(examine_by_own_past, exams)), None)) is not None and own.alarm.any():
         diagnosis, correction = diagnose_examination(own, progress)
         return _with_warnings(diagnosis, [own_past_warning(own), *sensors]), own, correction
@@ -230,8 +228,10 @@ def diagnose_examination(
         verdict = "healthy" if is_repaired(exam, intervals) else verdict
         warnings = _all_warnings(exam, doubts)
         headline = build_headline(verdict, intervals, {}, warnings, baseline.point)
-    elif change := _feature_change(exam):
-        headline, intervals, warnings = change["headline"], change["intervals"], _all_warnings(exam, [])
+    elif (change := next(findings(exam, "change"), None)) is not None:
+        unknown = (Candidate(name=UNKNOWN, probability=1.0),)
+        intervals = (FaultInterval(detected_at_s=change.from_s, probability=1.0, candidates=unknown),)
+        headline, warnings = change.text, _all_warnings(exam, [])
     else:
         verdict, headline, warnings = judge_without_alarm(exam)
     interval = next(
@@ -256,21 +256,6 @@ def diagnose_examination(
         point=baseline.point or None,
     )
     return diagnosis, correction
-
-
-def _feature_change(exam: Examination) -> dict[str, Any]:
-    """Return what a diagnosis says of features that changed; their limits widen beyond the learned covariates."""
-    features, change = exam.features, next(findings(exam, "change"), None)
-    if features is None or features.changed is None or change is None:
-        return {}
-    unknown = (Candidate(name=UNKNOWN, probability=1.0),)
-    interval = FaultInterval(detected_at_s=change.from_s, probability=1.0, candidates=unknown)
-    return {
-        "verdict": "fault",
-        "headline": change.text,
-        "reasons": features.reasons(features.changed, alone=True),
-        "intervals": (interval,),
-    }
 
 
 def judge_without_alarm(exam: Examination) -> tuple[Verdict, Message, list[DiagnosisWarning]]:

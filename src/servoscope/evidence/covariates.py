@@ -24,7 +24,7 @@ MAX_DEGREE = 2
 # standard deviations from zero from which a coefficient changes in proportion, as physics do
 MIN_PROPORTIONAL_STDS = 10.0
 ROUNDS = 3  # the first finds the noise, in which the covariates had still counted
-MIN_SAMPLES_PER_COEFFICIENT = 20  # usable samples of a stretch
+MIN_SAMPLES_PER_COEFFICIENT = 20  # usable samples of a recording, or of a stretch of it
 GRID_SIZE = 201  # values of a covariate that are tried
 
 
@@ -177,11 +177,9 @@ def _judge(exam: Examination) -> Iterator[Finding]:
     if exam.along is None:
         return
     rate, hold_s = exam.recording.sample_rate, exam.baseline.loop.monitor.covariate_hold_s
-    stale = exam.along.model.describe_stale(exam.recording.channels, hold_s, rate)
-    if (outside := exam.along.outside) is not None:
-        yield Finding.throughout(exam, "undetermined", "outside", outside)
-    elif stale is not None:
-        yield Finding.throughout(exam, "undetermined", "signals", stale)
+    unknown = exam.along.outside or exam.along.model.describe_stale(exam.recording.channels, hold_s, rate)
+    if unknown is not None:
+        yield Finding.throughout(exam, "undetermined", "signals", unknown)
     elif exam.alarm.any():
         yield from _doubt_values(exam, exam.along)
 

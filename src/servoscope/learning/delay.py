@@ -10,7 +10,7 @@ from servoscope.core.errors import RecordingError
 from servoscope.core.messages import Message, message
 from servoscope.estimation.reference_period import reference_period
 from servoscope.learning.inspection import delay as alignment
-from servoscope.learning.inspection import model_order, residual
+from servoscope.learning.inspection import model_order, residual, rules
 from servoscope.learning.inspection.delay_fit import DelayFit, fit_delay
 from servoscope.models.loop import Loop
 from servoscope.models.lti import settling_samples
@@ -20,7 +20,6 @@ TOLERANCE = 0.3  # rad at the filter's cutoff, beyond which a recording is refus
 MIN_PHASE_NOTED = 0.06  # rad; an inverse that is too simple moves the estimate a little, so this is only said
 # rad; a delay whose standard deviation is larger is not told: setting it might be as wrong as TOLERANCE
 MAX_PHASE_STD = 0.1
-MIN_VARIANCE_SHARE = 0.1  # share of the residual variance below which a regression's delay is not mentioned
 NORMAL_95 = 1.96  # standard deviations, half of a 95 % interval
 DELAY_FORMAT = ".4g"  # how a delay is written into the loop file, as the message has it
 
@@ -41,7 +40,7 @@ def check_delay(
     g = model_order.form_regressors(recording, loop)
     to_rad = 2.0 * np.pi * loop.cutoff  # at the cutoff
     regression = _regression_delay(loop, recording, g)
-    seconds = regression.seconds if regression is not None and regression.gain >= MIN_VARIANCE_SHARE else None
+    seconds = regression.seconds if regression is not None and regression.gain >= rules.DELAY_GAIN else None
     if seconds is not None and loop.delay == 0.0 and -to_rad * seconds >= MIN_PHASE_NOTED:
         return seconds, [message("learning.y_early", recording=recording.name, early_ms=-seconds * 1e3)]
     fit = fit_delay(loop, recording, g)
@@ -81,7 +80,7 @@ def _unverified(
         return None, [message("learning.delay_unknown")]
     if to_rad * abs(regression.seconds - loop.delay) < MIN_PHASE_NOTED:
         return regression.seconds, []
-    if regression.gain < MIN_VARIANCE_SHARE:
+    if regression.gain < rules.DELAY_GAIN:
         return None, []
     values = {"recording": recording.name, "late_ms": regression.seconds * 1e3, "configured_s": loop.delay}
     return None, [message("learning.delay_unverified", **values)]

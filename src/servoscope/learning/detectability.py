@@ -17,15 +17,14 @@ from servoscope.estimation.pipeline import Estimates, Pipeline
 from servoscope.estimation.tuning import TuningFit
 from servoscope.evidence.kind import HealthyRecordings
 from servoscope.learning.healthy_plant import PlantKnowledge
+from servoscope.learning.inspection.rules import GOOD_EXPLAINED_SHARE, MIN_MEMORIES
 from servoscope.learning.instrument import noise_moments
 from servoscope.learning.scatter import HealthyPaths, Scatter, forecast_covariance
 from servoscope.models.loop import Loop
 from servoscope.models.lti import solve_scaled
 
-MIN_MEMORIES = 10.0  # memories; a shorter baseline is warned about
 MAX_SUPPORTED_BUDGET = 8766.0  # false alarms per year, one an hour: above, nothing is supported
 MIN_USELESS_CHANGE = 1.0  # relative change: where only larger ones can be detected, nothing can
-MIN_EXPLAINED_SHARE = 0.9  # share of u's variance
 MAX_SILENT_BIAS_STDS = 1.0 / 3.0  # standard deviations that noise in phi may move the iFRF in silence
 MAX_T2_PER_COEFFICIENT = 2.0  # T^2 per coefficient on healthy data above which the model is said to be wrong
 
@@ -43,7 +42,7 @@ def learn_detectability(
     loop, fit, monitor = healthy.loop, plant.fit, healthy.loop.monitor
     notes = noise_notes(healthy.pipeline, fit, paths.estimates, can_simulate(loop))
     excess, suggestion = baseline_misfit(paths.estimates, paths.deviations, covariance, fit)
-    if fit.explained < MIN_EXPLAINED_SHARE:
+    if fit.explained < GOOD_EXPLAINED_SHARE:
         notes.append(message("learning.hardly_explained", share=fit.explained))
     if excess > MAX_T2_PER_COEFFICIENT and monitor.model_error < suggestion:
         notes.append(message("learning.model_error", excess=excess, model_error=suggestion))

@@ -19,7 +19,7 @@ from servoscope.core.files import atomic_write
 from servoscope.core.messages import Message, message, render
 from servoscope.core.settings_errors import describe_error
 from servoscope.learning.inspection import Inspection, inspect
-from servoscope.learning.inspection.rules import advised_rest_speed
+from servoscope.learning.inspection.rules import GOOD_EXPLAINED_SHARE, MIN_MEMORIES, advised_rest_speed
 from servoscope.learning.plant_choice import PlantCandidate, choose_plant
 from servoscope.models.loop import Columns, Loop, MonitorSettings
 from servoscope.models.plants import plant_class
@@ -43,7 +43,6 @@ from servoscope.signals.readers.units import split_unit
 from servoscope.signals.readers.wrap import find_wrap
 
 PART_ROWS = 400_000  # of a log, that are looked at; more are read in whole chunks
-MEMORIES = 10.0  # that a recording to learn from should have at least
 MAX_MEMORY_S, MIN_PERIODS = 5.0, 5.0  # of the estimator; periods of the cutoff that it holds at least
 JITTER_PERCENT = 5.0  # of a sample: standard deviation of the steps above which rows are resampled
 SPEED_AXIS = {"kind": "axis", "y": "speed", "terms": ["viscous", "coulomb", "offset"]}
@@ -55,7 +54,6 @@ COVARIATE_STEMS = {
 }
 MIN_SLOW_SHARE = 0.5  # of the variance of a covariate, that lies between memories: what is faster follows the motion
 MAX_SPAN_RATIO = 8.0  # of r over y, or y over r, beyond which one of them is in another unit
-MIN_CLEAR_SHARE = 0.9  # share of u that a plant explains; below it, the choice is in doubt
 
 
 @dataclass(frozen=True)
@@ -155,7 +153,7 @@ def propose_loop(paths: Sequence[Path], columns: Columns, where: Mapping[str, st
     cutoff = number_format.round_down(
         min(inspection.suggested_cutoff_hz, resampled if isinstance(resampled, float) else math.inf)
     )
-    memory = max(MIN_PERIODS / cutoff, min(MAX_MEMORY_S, recording.duration_s / MEMORIES))
+    memory = max(MIN_PERIODS / cutoff, min(MAX_MEMORY_S, recording.duration_s / MIN_MEMORIES))
     memory = number_format.round_down(memory)
     frequencies = [f for f in MonitorSettings().frequencies if f <= cutoff] or [float(f"{cutoff / 2.0:.2g}")]
     monitor: dict[str, object] = {"cutoff": cutoff, "memory": memory, "frequencies": frequencies}
@@ -240,7 +238,7 @@ def _plant_lines(chosen: PlantCandidate) -> list[ProposalLine]:
         written = json.dumps(value, ensure_ascii=False)
         if isinstance(value, Mapping):
             written = f"{{{', '.join(f'{name} = {_quoted(text)}' for name, text in value.items())}}}"
-        lines.append(ProposalLine("plant", key, written, why, key == "kind" and share < MIN_CLEAR_SHARE))
+        lines.append(ProposalLine("plant", key, written, why, key == "kind" and share < GOOD_EXPLAINED_SHARE))
     return lines
 
 

@@ -16,7 +16,7 @@ from servoscope.estimation import two_stage
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.pipeline import Pipeline, Regression, Tuning
 from servoscope.estimation.tuning import TuningFit, fit_tuning
-from servoscope.evidence.covariates import fit_covariates
+from servoscope.evidence.covariates import MIN_SAMPLES_PER_COEFFICIENT, fit_covariates
 from servoscope.evidence.kind import HealthyRecordings
 from servoscope.evidence.population import Population
 from servoscope.evidence.signals import describe_misfit, find_signal_defect
@@ -25,7 +25,6 @@ from servoscope.learning.instrument import learn_instrument, learns_instrument
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 
-MIN_SAMPLES_PER_COEFFICIENT = 20  # usable samples of every recording
 SPEED_OVER = 0.05  # s over which a speed is measured here
 REST_SPEED_SHARE = 0.02  # of the speed of motion, below which an axis stands still
 MIN_INSTRUMENT_EIGENVALUE = 0.05  # below, the instrument says too little of the regressor to be worth its variance

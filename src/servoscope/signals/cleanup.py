@@ -243,20 +243,25 @@ def _gap_defects(t: FloatArray, after: IndexArray, dropped: FloatArray, period: 
     return limit_defects(defects)
 
 
-def _saturation_defects(t: FloatArray, u: FloatArray, limits: tuple[float, float] | None) -> list[Defect]:
-    low, high = limits or (
-        min(float(u[rows].min()) for rows in outofcore.iter_chunks(0, u.size, u)),
-        max(float(u[rows].max()) for rows in outofcore.iter_chunks(0, u.size, u)),
-    )
-    slack = 0.0 if limits is None else 1e-6 * (high - low)
-    defects = []
+def rows_at_limits(u: FloatArray, limits: tuple[float, float] | None, slack: float) -> list[tuple[float, IndexArray]]:
+    """Return the highest and the lowest value of u, and the rows within a `slack` of each, as a share of the range.
+
+    Of `limits`, or without them of plateaus at the extremes: where there is none, there are no rows.
+    """
+    low, high = limits or outofcore.extremes(u)
+    least, ends = -slack * (high - low), list[tuple[float, IndexArray]]()
     for sign, value in ((1.0, high), (-1.0, low)):
-        touching = outofcore.find_rows(lambda rows, s=sign, v=value: s * (u[rows] - v) >= -slack, u)  # type: ignore[misc]
-        if limits is None:
-            lengths = [rows.size for rows in split_consecutive(touching)]
-            # Resting at 0, or moving between two values only, is not a limit.
-            if value == 0.0 or max(lengths, default=0) < PLATEAU_SAMPLES or touching.size > 0.5 * u.size:
-                continue
+        rows = outofcore.find_rows(lambda rows, s=sign, v=value: s * (u[rows] - v) >= least, u)  # type: ignore[misc]
+        longest = max((stretch.size for stretch in split_consecutive(rows)), default=0)
+        # Resting at 0, or moving between two values only, is not a limit.
+        is_limit = limits is not None or (value != 0.0 and longest >= PLATEAU_SAMPLES and rows.size <= 0.5 * u.size)
+        ends.append((value, rows if is_limit else rows[:0]))
+    return ends
+
+
+def _saturation_defects(t: FloatArray, u: FloatArray, limits: tuple[float, float] | None) -> list[Defect]:
+    defects = []
+    for value, touching in rows_at_limits(u, limits, 0.0 if limits is None else 1e-6):
         # A limit cycle touches the limit again and again: touches within a second are one event.
         times = t[touching]
         key = "defect.plateau" if limits is None else "defect.saturation"

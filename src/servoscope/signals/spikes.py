@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from servoscope.core import outofcore
 from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
+from servoscope.signals.timebase import NO_ROWS, previous_rows, time_steps
 
 MAX_WIDTH = 10  # samples
 MAX_NORMAL_WIDTH = 3  # samples; wider ones must be enormous
@@ -22,7 +22,6 @@ REACTION_SAMPLES = 3  # samples in which u may kick after a step of r
 PASSES = 30
 LEVEL_SAMPLES = 500  # samples that are enough to guess two levels
 CHUNK_PLACES = 512  # that are looked at together: each of them brings the pages around it into memory
-_NO_ROWS = np.empty(0, dtype=np.intp)
 
 
 def find_spikes(
@@ -43,7 +42,7 @@ def find_spikes(
     runs; `share`: smallest height of a spike, as a share of the signal's range; `excused`: tells which of some
     samples may jump, for example u where the reference steps.
     """
-    spikes = _NO_ROWS
+    spikes = NO_ROWS
     if _is_quiet(x, run, share):
         return spikes
     for _ in range(PASSES):  # spikes hide others: range and neighbours are taken again without those found
@@ -62,7 +61,7 @@ def find_spikes(
 
 def follows_reference_step(r: FloatArray, run: npt.NDArray[np.int32], rows: IndexArray) -> BoolArray:
     """Return at which of some rows (n,) a controller may kick: where r steps or a run starts, shape (n,)."""
-    low, high = _range(r)
+    low, high = outofcore.extremes(r)
     kicked = np.zeros(rows.size, dtype=np.bool_)
     for places in outofcore.iter_chunks(0, rows.size, r, run, at_once=CHUNK_PLACES):
         for offset in range(-1, REACTION_SAMPLES + 1):
@@ -106,24 +105,11 @@ def _is_quiet(x: FloatArray, run: npt.NDArray[np.int32], share: float) -> bool:
     return True
 
 
-def _range(x: FloatArray) -> tuple[float, float]:
-    ranges = [(float(x[rows].min()), float(x[rows].max())) for rows in outofcore.iter_chunks(0, x.size, x)]
-    return min(low for low, _ in ranges), max(high for _, high in ranges)
-
-
-def _previous(x: npt.NDArray[Any], rows: slice) -> npt.NDArray[Any]:
-    return x[rows.start - 1 : rows.stop - 1]
-
-
-def _differences(x: FloatArray, rows: slice) -> FloatArray:
-    return np.asarray(x[rows] - _previous(x, rows))
-
-
 def _find_spikes_once(
     z: FloatArray, run: npt.NDArray[np.int32], share: float, excused: Callable[[IndexArray], BoolArray]
 ) -> IndexArray:
     if z.size < 2 * NEIGHBOURS:
-        return _NO_ROWS
+        return NO_ROWS
     some = outofcore.sample_chunks(z.size)
     span = float(np.subtract(*np.quantile(np.concatenate([z[rows] for rows in some]), [0.99, 0.01])))
     moving = np.abs(np.concatenate([np.diff(z[rows]) for rows in some]))
@@ -137,9 +123,9 @@ def _find_spikes_once(
 
     def enters(rows: slice) -> BoolArray:
         nonlocal highest
-        steps = np.abs(_differences(z, rows))
+        steps = np.abs(time_steps(z, rows))
         highest = max(highest, float(steps.max()))
-        return np.asarray((steps > least) | (run[rows] != _previous(run, rows)))
+        return np.asarray((steps > least) | (run[rows] != run[previous_rows(rows)]))
 
     entered = np.append(0, outofcore.find_rows(enters, z, run, first=1))
     for width in range(1, MAX_WIDTH + 1):
@@ -153,7 +139,7 @@ def _find_spikes_once(
         if start.size:
             # narrow ones first: what lies between two of them looks like a wide one of the other sign
             return np.unique(start + np.arange(width)[:, None])
-    return _NO_ROWS
+    return NO_ROWS
 
 
 def _find_excursions(

@@ -19,7 +19,7 @@ MIN_MAX_DELAY_SAMPLES = 8  # samples
 CHI2_95_1DOF = 3.841458820694124  # chi-square quantile, 1 degree of freedom
 PARABOLA = 1e-12  # curvature relative to the variance below which there is none
 MAX_INTERVAL_SAMPLES = 1.5  # samples that the interval may span in total
-PRIOR = 0.3  # standard deviation of a coefficient around its nominal value, relative to it
+PRIOR = 0.3  # standard deviation of a coefficient or parameter around its nominal value, relative to it
 FLOOR = 0.005  # share of eta (rms) that the intersample model of y alone leaves unexplained
 
 

@@ -14,15 +14,15 @@ from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.estimation.noise_model import WhiteNoise, largest_autocorrelation
 from servoscope.fit.plant_experiment import LAGS, MAX_SAMPLES, PlantExperiment, robust_covariance
 from servoscope.fit.search import MAX_STEPS, Fit, fit
-from servoscope.learning.inspection.delay import MAX_DELAY_S, MIN_MAX_DELAY_SAMPLES
+from servoscope.learning.inspection.delay import MAX_DELAY_S, MIN_MAX_DELAY_SAMPLES, PRIOR
 from servoscope.learning.inspection.model_order import Regressors, fit_regression
 from servoscope.models.loop import Loop
 from servoscope.models.lti import settling_samples
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 
-PRIOR = 0.3  # standard deviation of the logarithm of a parameter that the loop file gives
-# and of a coefficient that least squares found: noise in its regressors may have made it a tenth
+# standard deviation of the logarithm of a coefficient that least squares found: noise in the regressors may have made
+# it a tenth
 COEFFICIENT_LOG_STD = 3.0
 START_NOISE_SHARE = 1e-3  # noise on u, of its standard deviation, at which the search begins
 MIN_NOISE_SHARE = 1e-9  # noise on y, of its standard deviation: what is quieter was simulated without any

@@ -30,7 +30,6 @@ class Spectra:
     # shape (F,)
     coherence_u: FloatArray
     coherence_y: FloatArray
-    segments: int  # number of segments that were averaged
 
 
 class Band(InspectionModel):
@@ -93,7 +92,7 @@ def spectra(recording: Recording, period: int | None = None) -> Spectra | None:
     coherence = np.clip((K * raw - 1.0) / (K - 1.0), 0.0, 1.0)
     coherence[:, power[0] <= floor[0]] = 0.0
     f = np.arange(1, length // 2 + 1) * recording.sample_rate / length
-    return Spectra(f, power[0], power[1], power[2], coherence[0], coherence[1], len(rows))
+    return Spectra(f, *power, *coherence)
 
 
 def _length(sizes: np.ndarray[tuple[int], np.dtype[np.int64]], samples: int) -> int:

@@ -16,7 +16,7 @@ FindingSeverity = Literal["stop", "care", "note"]
 InspectionVerdict = Literal["usable", "usable with care", "not usable"]
 
 MEMORY_S = 5.0  # of the estimator, without a loop
-MIN_EXPLAINED_SHARE, GOOD_EXPLAINED_SHARE = 0.5, 0.9
+MIN_EXPLAINED_SHARE, GOOD_EXPLAINED_SHARE = 0.5, 0.9  # share of the variance of u
 STILL_SHARE, MOSTLY_STILL_SHARE, HALF_STILL_SHARE = 0.97, 0.8, 0.5
 SNR = 3.0
 MAX_RELATIVE_STD = 0.05  # relative standard deviation of the iFRF that the estimator's memory should allow
@@ -24,7 +24,7 @@ CONDITION = 1e3
 MIN_BITS = 8.0
 DELAY_TOLERANCE = 0.1  # samples
 DELAY_GAIN = 0.1  # share of the residual variance below which a delay is not mentioned
-MIN_MEMORIES = 10.0
+MIN_MEMORIES = 10.0  # memories of the estimator that a recording to learn from should last at least
 MODEL_ERROR = 0.005
 DETECTABLE_STDS = 7.0  # root of a usual threshold: a change of so many standard deviations is detected
 

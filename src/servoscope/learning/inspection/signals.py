@@ -13,11 +13,11 @@ from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.messages import Message, message
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
-from servoscope.signals.defects import mask_spans
+from servoscope.signals.cleanup import rows_at_limits
+from servoscope.signals.defects import mask_spans, split_consecutive
 
 MIN_STEP_SHARE = 1e-7  # share of the range below which a step is rounding of the file, not of the sensor
 ON_GRID = 0.98  # share of values that must be whole steps
-PLATEAU = 5  # samples in a row at the very extreme before u is said to be at a limit
 REST_SPEED_SHARE = 0.02  # share of the fast speeds (99th percentile) below which the output rests
 MIN_REST_S = 0.25  # s: turning round is not rest
 BINS = 40  # of |u|, to look for a dead zone
@@ -164,29 +164,16 @@ def white_noise_std(x: FloatArray, restart: BoolArray, step: float | None) -> fl
 
 def saturation(recording: Recording, loop: Loop | None) -> Saturation:
     """Count the samples at the loop's limits, or, where it names none, on plateaus at the extremes of u."""
-    u = recording.u
     given = loop.input_limits if loop is not None else None
-    low, high = given if given is not None else (float(u.min()), float(u.max()))
-    slack = 1e-6 * (high - low)
-    at: list[BoolArray] = []
-    ends: list[float | None] = []
-    for mask, value in ((u <= low + slack, low), (u >= high - slack, high)):
-        if given is None:
-            lengths = [stop - start for start, stop in mask_spans(mask)]
-            # Resting at 0, or moving between two values only, is not a limit.
-            if value == 0.0 or max(lengths, default=0) < PLATEAU or mask.mean() > 0.5:
-                mask = np.zeros_like(mask)
-        at.append(mask)
-        ends.append(value if given is not None or mask.any() else None)
-    longest = max((stop - start for mask in at for start, stop in mask_spans(mask)), default=0)
-    seen: Literal["seen", "none"] = "seen" if any(end is not None for end in ends) else "none"
+    (high, at_high), (low, at_low) = rows_at_limits(recording.u, given, 1e-6)
+    stretches = [*split_consecutive(at_low), *split_consecutive(at_high)]
     return Saturation(
-        low=ends[0],
-        high=ends[1],
-        share_low=float(at[0].mean()),
-        share_high=float(at[1].mean()),
-        longest_s=longest / recording.sample_rate,
-        source="loop" if given is not None else seen,
+        low=low if given is not None or at_low.size else None,
+        high=high if given is not None or at_high.size else None,
+        share_low=at_low.size / recording.samples,
+        share_high=at_high.size / recording.samples,
+        longest_s=max((rows.size for rows in stretches), default=0) / recording.sample_rate,
+        source="loop" if given is not None else "seen" if stretches else "none",
     )
 
 

@@ -11,13 +11,12 @@ from typing import Any
 from servoscope.core.errors import EmptyRecordingError, RecordingError
 from servoscope.models.loop import TextLayout
 from servoscope.signals.readers.guess_columns import WORDS
-from servoscope.signals.readers.layout import THOUSANDS, check_names, count_numeric, find_table
-from servoscope.signals.readers.table import NULL_TEXTS, Table, TableFile, is_number
+from servoscope.signals.readers.layout import HEAD_ROWS, THOUSANDS, check_names, count_numeric, find_table
+from servoscope.signals.readers.table import NULL_TEXTS, Table, TableFile, is_number, one_line_errors
 
 COMMENTS = ("#", "%", "//")
 DELIMITERS = (";", "\t", ",", "|", " ")
 HEAD_BYTES = 1 << 16  # that tell the layout
-HEAD_LINES = 400
 MIN_HEAD_LINES = 8  # a file of thousands of columns has fewer in so many bytes
 MAX_LINE_BYTES = 1 << 22
 LINE_ENDS = ";%"  # that stand behind each row in files of some programs
@@ -69,7 +68,7 @@ def detect_layout(path: Path, head: bytes, text: TextLayout, cut: bool = False) 
     lines = head.decode(encoding, errors="replace").splitlines()
     if cut:
         lines = lines[:-1] or lines
-    lines = lines[:HEAD_LINES]
+    lines = lines[:HEAD_ROWS]
     comments = (text.comment,) if text.comment else COMMENTS
     plain = ["" if line.lstrip().startswith(comments) else line for line in lines]
     plain[: text.skip_rows] = [""] * min(text.skip_rows, len(plain))
@@ -250,15 +249,13 @@ def _parse_chunk(
             memory_pool=pa.system_memory_pool(),  # others keep a hundred megabytes once they are not used any more
         )
 
-    try:
+    with one_line_errors(path, "cannot be read as CSV", kinds=(pa.ArrowInvalid,)):
         # threads that still let go of a small text while Python ends would abort the process
         table = parse(len(text) > SINGLE_BLOCK_BYTES)
         if torn or comments:
             # row numbers, which messages name, exist without threads only
             torn.clear()
             table = parse(False)
-    except pa.ArrowInvalid as error:
-        raise RecordingError(f"{path}: cannot be read as CSV ({' '.join(str(error).split())[:100]})") from None
     return {name: table.column(name) for name in wanted}, torn
 
 

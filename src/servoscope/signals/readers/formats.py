@@ -61,7 +61,7 @@ BUILT_IN = {
     for suffixes, format_, module, *arguments in (
         (".csv .txt .tsv .dat .asc .log", "CSV", "csv", "open_csv"),
         (".parquet .pq", "Parquet", "parquet", "open_parquet"),
-        (".mat", "MAT", "mat", "open_mat"),
+        (".mat", "MAT", "mat", "open_mat", "", "", True),  # SciPy trusts its types: a wrong one kills
         (".mf4 .mdf", "MDF", "mdf_tdms", "open_mdf", "asammdf", "mdf", True),
         (".tdms", "TDMS", "mdf_tdms", "open_tdms", "nptdms", "tdms", True),
         (".h5 .hdf5", "HDF5", "mat", "open_hdf5", "", "", True),

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from servoscope.core.errors import RecordingError
 from servoscope.models.loop import TextLayout
 from servoscope.signals.readers.formats import open_file
-from servoscope.signals.readers.table import Table, TableFile, shorten_error
+from servoscope.signals.readers.table import Table, TableFile, one_line_errors
 
 
 class ArrowStream(Protocol):
@@ -45,10 +45,10 @@ def open_source(source: Source, text: TextLayout | None = None) -> TableFile:
             raise RecordingError(f"arrays: their lengths differ ({told}), give columns of one length")
         return _open_table("arrays", pa.table(columns))
     if hasattr(source, "__arrow_c_stream__"):
-        try:
+        with one_line_errors(
+            "frame", "cannot be read", "give plain columns", (pa.ArrowException, TypeError, ValueError)
+        ):
             return _open_table("frame", pa.table(source))
-        except (pa.ArrowException, TypeError, ValueError) as error:
-            raise RecordingError(f"frame: cannot be read ({shorten_error(error)}), give plain columns") from None
     kind = type(source).__name__
     raise TypeError(f"a recording is read from a path, a frame or a mapping of arrays, not from {kind}")
 

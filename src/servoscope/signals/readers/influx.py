@@ -9,7 +9,7 @@ from urllib.parse import unquote, urlsplit
 
 from servoscope.core.errors import RecordingError
 from servoscope.signals.readers.addresses import TableAddress
-from servoscope.signals.readers.table import TableFile, shorten_error
+from servoscope.signals.readers.table import TableFile, one_line_errors
 
 CHUNK_ROWS = 10_000  # that the server sends at a time
 TIMEOUT_S = 60.0
@@ -60,20 +60,18 @@ def _answer(address: TableAddress, query: str) -> Iterator[dict[str, Any]]:
     host = url.netloc.rpartition("@")[2]
     parameters: dict[str, str | int] = {"db": database, "q": query, "epoch": "ns"}
     parameters |= {"chunked": "true", "chunk_size": CHUNK_ROWS}
-    try:
-        with httpx.stream(
-            "GET", f"{url.scheme}://{host}/query", params=parameters, headers=headers, auth=login, timeout=TIMEOUT_S
-        ) as answer:
-            if answer.status_code != 200:
-                raise RecordingError(f"{address.text}: the server answers {answer.status_code}, see {variable}")
-            for line in answer.iter_lines():
-                for result in json.loads(line)["results"] if line.strip() else ():
-                    if "error" in result:
-                        raise RecordingError(f"{address.text}: the server says: {result['error']}")
-                    yield from result.get("series", ())
-    except (httpx.HTTPError, ValueError, KeyError) as error:
-        why = shorten_error(error) or type(error).__name__
-        raise RecordingError(f"{address.text}: cannot be read from {host} ({why})") from None
+    kinds, place = (httpx.HTTPError, ValueError, KeyError), f"{url.scheme}://{host}/query"
+    with (
+        one_line_errors(address.text, f"cannot be read from {host}", kinds=kinds),
+        httpx.stream("GET", place, params=parameters, headers=headers, auth=login, timeout=TIMEOUT_S) as answer,
+    ):
+        if answer.status_code != 200:
+            raise RecordingError(f"{address.text}: the server answers {answer.status_code}, see {variable}")
+        for line in answer.iter_lines():
+            for result in json.loads(line)["results"] if line.strip() else ():
+                if "error" in result:
+                    raise RecordingError(f"{address.text}: the server says: {result['error']}")
+                yield from result.get("series", ())
 
 
 def _quote(name: str) -> str:

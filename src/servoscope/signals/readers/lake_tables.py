@@ -8,21 +8,18 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from servoscope.core.errors import RecordingError
 from servoscope.signals.readers.addresses import TableAddress
-from servoscope.signals.readers.table import TableFile, shorten_error
+from servoscope.signals.readers.table import TableFile, one_line_errors
 
 
 def open_delta(address: TableAddress) -> TableFile:
     """Open ``delta:FOLDER``, or a URL of an object store; its newest version."""
     address.require("deltalake", "lake")
-    import pyarrow as pa
     from deltalake import DeltaTable
 
-    try:
+    unreadable = address.text, "cannot be read as a table of Delta"
+    with one_line_errors(*unreadable):
         rows = DeltaTable(_location(address.place)).to_pyarrow_dataset()
-    except Exception as error:  # of several kinds, Rust's among them
-        raise _unreadable(address, "Delta", error) from None
     time = address.time_column(rows.schema.names)
 
     def read(wanted: Sequence[str]) -> Iterator[dict[str, Any]]:
@@ -35,10 +32,8 @@ def open_delta(address: TableAddress) -> TableFile:
             if limit is not None and time is not None:
                 bound = _scalar(address, rows.schema.field(time).type, limit)
                 chosen &= ds.field(time) >= bound if after else ds.field(time) < bound
-        try:
+        with one_line_errors(*unreadable):
             arrow = rows.to_table(columns=_with_time(wanted, time), filter=chosen)
-        except (pa.ArrowException, OSError) as error:
-            raise _unreadable(address, "Delta", error) from None
         yield _ordered(arrow, wanted, time)
 
     return address.table(rows.schema.names, read)
@@ -51,10 +46,9 @@ def open_iceberg(address: TableAddress) -> TableFile:
     """
     address.require("pyiceberg", "lake")
     expressions: Any = import_module("pyiceberg.expressions")  # takes names and texts, which its types do not say
-    try:
+    unreadable = address.text, "cannot be read as a table of Iceberg"
+    with one_line_errors(*unreadable):
         table = _iceberg_table(address.place)
-    except Exception as error:  # of several kinds
-        raise _unreadable(address, "Iceberg", error) from None
     names = [field.name for field in table.schema().fields]
     time = address.time_column(names)
 
@@ -68,10 +62,8 @@ def open_iceberg(address: TableAddress) -> TableFile:
         ):
             if limit is not None and time is not None:
                 chosen = expressions.And(chosen, compare(time, _bound(address, table, time, limit)))
-        try:
+        with one_line_errors(*unreadable):
             arrow = table.scan(row_filter=chosen, selected_fields=tuple(_with_time(wanted, time))).to_arrow()
-        except Exception as error:  # of several kinds
-            raise _unreadable(address, "Iceberg", error) from None
         yield _ordered(arrow, wanted, time)
 
     return address.table(names, read)
@@ -104,10 +96,6 @@ def _location(place: str) -> str:
     return re.sub(r"^([a-z][a-z0-9]+):/(?!/)", r"\1://", place)
 
 
-def _unreadable(address: TableAddress, kind: str, error: Exception) -> RecordingError:
-    return RecordingError(f"{address.text}: cannot be read as a table of {kind} ({shorten_error(error)})")
-
-
 def _with_time(wanted: Sequence[str], time: str | None) -> list[str]:
     return list(wanted) if time is None or time in wanted else [*wanted, time]
 
@@ -121,15 +109,11 @@ def _ordered(table: Any, wanted: Sequence[str], time: str | None) -> dict[str, A
 def _scalar(address: TableAddress, kind: Any, value: str) -> Any:
     import pyarrow as pa
 
-    try:
+    with one_line_errors(address.text, f"{value!r} does not go with the column", kinds=(pa.ArrowException,)):
         if pa.types.is_timestamp(kind):
             moment = address.moment(value)
             return pa.scalar(moment if kind.tz else moment.replace(tzinfo=None), kind)
         return pa.scalar(value).cast(kind)
-    except pa.ArrowException as error:
-        raise RecordingError(
-            f"{address.text}: {value!r} does not go with the column ({shorten_error(error)})"
-        ) from None
 
 
 def _bound(address: TableAddress, table: Any, time: str, value: str) -> str:

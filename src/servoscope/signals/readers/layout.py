@@ -13,6 +13,7 @@ from servoscope.signals.readers.guess_columns import guess_columns
 from servoscope.signals.readers.table import NULL_TEXTS, TIME_UNITS, is_number
 from servoscope.signals.readers.units import is_unit, parse_quantity, with_unit
 
+HEAD_ROWS = 400  # of a text or a sheet, that tell where the table begins
 LOOKAHEAD_ROWS = 5  # rows that tell whether a table begins
 TABLE_ROW_SHARE = 0.6  # share of them that must look like rows of it
 MAX_UNIT_LENGTH = 12  # of a cell in a row of units

@@ -1,13 +1,8 @@
-"""Reads MAT files, also with timetables and records of dSPACE ControlDesk, and other HDF5 files.
-
-MAT files of version 5 are checked first: SciPy trusts the types that they name, and a wrong one ends the process.
-"""
+"""Reads MAT files, also with timetables and records of dSPACE ControlDesk, and other HDF5 files."""
 
 from __future__ import annotations
 
 import re
-import struct
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,31 +12,14 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.reader_process import open_bounded
-from servoscope.signals.readers.table import Table, TableFile, shorten_error
+from servoscope.signals.readers.table import Table, TableFile, one_line_errors
 from servoscope.signals.readers.units import split_unit, with_unit
 
-HEADER_BYTES = 128  # bytes of text, version and byte order
-TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 14: 1, 16: 1, 17: 2, 18: 4}  # bytes of one
-MATRIX, COMPRESSED = 14, 15
-MAX_DEPTH = 30  # structures in structures
 IN_OTHER_FILE = "lies in another file, which is not read: save all data in one file"
 
 
 def open_mat(path: Path) -> TableFile:
-    """Open a MAT file, version 5 or 7.3; what SciPy does not read, in a process of its own."""
-    import h5py
-
-    def has_objects(variables: Mapping[str, Any]) -> bool:
-        return any(name == "__function_workspace__" or _is_object(value) for name, value in variables.items())
-
-    if h5py.is_hdf5(path):
-        return open_bounded(path, "MAT", __name__, "open_mat_objects", "matio")
-    return _open_variables(path, "MAT", _load_mat5, has_objects)
-
-
-def open_mat_objects(path: Path) -> TableFile:
-    """Open a MAT file of version 7.3, or one that holds objects, such as timetables."""
+    """Open a MAT file, version 5 or 7.3, also with objects such as timetables."""
     return _open_variables(path, "MAT", _load_mat)
 
 
@@ -50,28 +28,12 @@ def open_hdf5(path: Path) -> TableFile:
     return _open_variables(path, "HDF5", lambda path: _load_hdf5(path, matlab=False))
 
 
-def _open_variables(
-    path: Path,
-    kind: str,
-    load: Callable[[Path], Mapping[str, Any]],
-    is_beyond: Callable[[Mapping[str, Any]], bool] = lambda _: False,
-) -> TableFile:
-    """Open a file whose variables are read at once; if they are beyond what `load` reads, in a process of its own."""
+def _open_variables(path: Path, kind: str, load: Callable[[Path], Mapping[str, Any]]) -> TableFile:
+    """Open a file whose variables are read at once."""
     import pyarrow as pa
 
-    try:
-        loaded = load(path)
-        beyond = is_beyond(loaded)
-        variables = {} if beyond else dict(_flatten(loaded))
-    except RecordingError:
-        raise
-    # SciPy and h5py raise nearly anything at damaged files, from MatReadError to AttributeError.
-    except Exception as error:
-        raise RecordingError(
-            f"{path}: is a damaged or unknown {kind} file ({shorten_error(error)}), save it again"
-        ) from None
-    if beyond:
-        return open_bounded(path, kind, __name__, "open_mat_objects", "matio")
+    with one_line_errors(path, f"is a damaged or unknown {kind} file", "save it again"):
+        variables = dict(_flatten(load(path)))
     lengths = [x.size for x in variables.values() if x.size > 1]
     # The channels are the vectors of the length that most of them, and of those the longest, have.
     rows = max(lengths, key=lambda size: (lengths.count(size), size), default=0)
@@ -81,24 +43,16 @@ def _open_variables(
     return TableFile(path, tuple(columns), lambda *_: iter([Table(path.name, columns)]), others, aliases=aliases)
 
 
-def _load_mat5(path: Path) -> dict[str, Any]:
-    import scipy.io
-
-    check_mat5(path)
-    loaded: dict[str, Any] = scipy.io.loadmat(path, squeeze_me=False)
-    hidden = ("__header__", "__version__", "__globals__")
-    return {name: value for name, value in loaded.items() if name not in hidden}
-
-
 def _load_mat(path: Path) -> dict[str, Any]:
     import h5py
+    import scipy.io
 
     if h5py.is_hdf5(path):
         loaded = _load_hdf5(path, matlab=True)
         with h5py.File(path, "r") as file:
             has_objects = "#subsystem#" in file
     else:
-        loaded = _load_mat5(path)
+        loaded = scipy.io.loadmat(path, squeeze_me=False)
         has_objects = any(name == "__function_workspace__" or _is_object(x) for name, x in loaded.items())
     if has_objects:
         if find_spec("matio") is None:
@@ -239,50 +193,3 @@ def _control_desk_channels(records: npt.NDArray[Any], name: str) -> Iterator[tup
         if values.dtype.kind in "fiub":
             is_axis = name.rpartition(".")[2] == "X"
             yield "time" if is_axis else label, np.ascontiguousarray(values.astype(values.dtype.newbyteorder("=")))
-
-
-def check_mat5(path: Path) -> None:
-    """Walk through all elements of a file.
-
-    Raises ValueError if a type is unknown, or an element ends outside of what holds it; raises zlib.error if what
-    is compressed cannot be unpacked.
-    """
-    data = memoryview(path.read_bytes())
-    if len(data) < HEADER_BYTES or bytes(data[126:128]) not in (b"IM", b"MI"):
-        return  # of an older version, or not to be read at all, which the reader tells
-    order = "<" if bytes(data[126:128]) == b"IM" else ">"
-    at = HEADER_BYTES
-    while at + 8 <= len(data):
-        kind, size = struct.unpack_from(order + "II", data, at)
-        inside = data[at + 8 : at + 8 + size]
-        if len(inside) < size:
-            raise ValueError("cut off")
-        if kind == COMPRESSED:
-            unpacked = memoryview(zlib.decompress(inside))
-            if len(unpacked) < 8:
-                raise ValueError("nothing inside")
-            kind, size = struct.unpack_from(order + "II", unpacked)
-            inside = unpacked[8 : 8 + size]
-        if kind != MATRIX:
-            raise ValueError(f"element of type {kind}")
-        _check_elements(inside, order, 0)
-        at += 8 + struct.unpack_from(order + "I", data, at + 4)[0]
-
-
-def _check_elements(inside: memoryview, order: str, depth: int) -> None:
-    """Check the elements of a matrix."""
-    if depth > MAX_DEPTH:
-        raise ValueError("structures too deep")
-    at = 0
-    while at + 8 <= len(inside):
-        kind, size = struct.unpack_from(order + "II", inside, at)
-        begin = at + 8
-        if kind >> 16:  # a short one, in four bytes behind its size
-            kind, size, begin = kind & 0xFFFF, kind >> 16, at + 4
-            if size > 4:
-                raise ValueError("a short element of more than four bytes")
-        if size % TYPE_BYTES.get(kind, size + 1) or begin + size > len(inside):
-            raise ValueError(f"element of type {kind} and {size} bytes")
-        if kind == MATRIX:
-            _check_elements(inside[begin : begin + size], order, depth + 1)
-        at = at + 8 if begin == at + 4 else begin + size + -size % 8

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.table import Table, TableFile
+from servoscope.signals.readers.table import CHUNK_ROWS, Table, TableFile, one_line_errors
 from servoscope.signals.readers.units import with_unit
 
-CHUNK_ROWS = 1 << 16  # that are read at a time
 DEFAULT_TIME_NAME = "time"  # of a raster whose clock has no name
 
 
@@ -46,10 +45,7 @@ MAX_RATIO = 1100  # rows per byte: of a byte each, deflated as far as deflate go
 
 def open_mdf(path: Path) -> TableFile:
     """Open an MDF file, version 3 or 4."""
-    try:
-        from asammdf import MDF
-    except ModuleNotFoundError:
-        raise RecordingError(f"{path}: MDF files need asammdf, pip install 'servoscope[mdf]'") from None
+    from asammdf import MDF
 
     logging.getLogger("asammdf").setLevel(logging.CRITICAL)  # broken files raise an error
     _ignore_external_attachments()
@@ -92,11 +88,8 @@ def open_mdf(path: Path) -> TableFile:
 
 def open_tdms(path: Path) -> TableFile:
     """Open a TDMS file."""
-    try:
-        from nptdms import TdmsFile
-        from nptdms.log import log_manager
-    except ModuleNotFoundError:
-        raise RecordingError(f"{path}: TDMS files need npTDMS, pip install 'servoscope[tdms]'") from None
+    from nptdms import TdmsFile
+    from nptdms.log import log_manager
 
     log_manager.set_level(logging.CRITICAL)  # broken files raise an error; no dump of their bytes on the terminal
 
@@ -168,33 +161,23 @@ def _open_measurement(
     list_rasters: Callable[[Any], list[_Raster]],
     read: _ReadChannels,
 ) -> TableFile:
-    def damaged(error: Exception) -> RecordingError:
-        text = " ".join(str(error).split())[:80] or type(error).__name__
-        return RecordingError(f"{path}: is a damaged {kind} file ({text}), export it again")
+    damaged = path, f"is a damaged {kind} file", "export it again"
 
     def read_chunks(wanted: Sequence[str], _: Collection[str]) -> Iterator[Table]:
         import pyarrow as pa
 
-        raster = _common_raster(path, rasters, wanted)
-        try:
-            with opened() as file:
-                for first in range(0, raster.rows, CHUNK_ROWS):
-                    rows = min(CHUNK_ROWS, raster.rows - first)
-                    cells = {name: np.asarray(x) for name, x in read(file, raster, wanted, first, rows).items()}
-                    if len({x.shape[0] for x in cells.values()}) > 1:
-                        raise ValueError("channels end before their raster does")
-                    yield Table(
-                        path.name, {name: pa.chunked_array([_arrow_values(x)]) for name, x in cells.items()}, first + 1
-                    )
-        # both libraries raise nearly anything at damaged files
-        except Exception as error:
-            raise damaged(error) from None
+        raster = next(raster for raster in rasters if {*wanted} <= {*raster.places})
+        with one_line_errors(*damaged), opened() as file:
+            for first in range(0, raster.rows, CHUNK_ROWS):
+                rows = min(CHUNK_ROWS, raster.rows - first)
+                cells = {name: np.asarray(x) for name, x in read(file, raster, wanted, first, rows).items()}
+                if len({x.shape[0] for x in cells.values()}) > 1:
+                    raise ValueError("channels end before their raster does")
+                columns = {name: pa.chunked_array([_arrow_values(x)]) for name, x in cells.items()}
+                yield Table(path.name, columns, first + 1)
 
-    try:
-        with opened() as file:
-            nonempty = [raster for raster in list_rasters(file) if raster.rows]
-    except Exception as error:
-        raise damaged(error) from None
+    with one_line_errors(*damaged), opened() as file:
+        nonempty = [raster for raster in list_rasters(file) if raster.rows]
     rasters = [raster.named() for raster in nonempty]
     names = dict.fromkeys(name for raster in rasters for name in raster.places)
     aliases = {name: raster.label(name) for raster in nonempty for name in raster.places if raster.label(name) != name}
@@ -202,19 +185,6 @@ def _open_measurement(
         raise RecordingError(f"{path}: holds no channels with values")
     groups = tuple(tuple(raster.places) for raster in rasters)
     return TableFile(path, tuple(names), read_chunks, channel_groups=groups, aliases=aliases)
-
-
-def _common_raster(path: Path, rasters: Sequence[_Raster], wanted: Sequence[str]) -> _Raster:
-    """Return the raster that has all channels that are wanted."""
-    for raster in rasters:
-        if set(wanted) <= set(raster.places):
-            return raster
-    best = max(rasters, key=lambda raster: len(set(wanted) & set(raster.places)))
-    strange = next(name for name in wanted if name not in best.places)
-    raise RecordingError(
-        f"{path}: {strange!r} was not sampled together with {', '.join(n for n in wanted if n in best.places)}: "
-        "export all of them in one raster"
-    )
 
 
 def _arrow_values(cells: Any) -> Any:

@@ -8,9 +8,8 @@ from os import SEEK_END
 from pathlib import Path
 
 from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.table import Table, TableFile, check_width, shorten_error
+from servoscope.signals.readers.table import CHUNK_ROWS, Table, TableFile, check_width, one_line_errors
 
-CHUNK_ROWS = 1 << 16  # that are read at a time
 BUFFER_BYTES = 1 << 20  # of each column
 MAX_FOOTER_BYTES = 32_000_000
 FOOTER_END_BYTES = 8  # at the end of the file: the length of the footer, and PAR1
@@ -21,29 +20,22 @@ def open_parquet(path: Path) -> TableFile:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    def damaged(error: Exception) -> RecordingError:
-        return RecordingError(f"{path}: is a damaged Parquet file ({shorten_error(error)}), write it again")
+    damaged = path, "is a damaged Parquet file", "write it again", (pa.ArrowException, OSError)
 
     def read(wanted: Sequence[str], _: Collection[str]) -> Iterator[Table]:
         first = 1
-        try:
-            # neither read_table nor a memory map: the one imports pandas, the other takes the file for memory
-            with pq.ParquetFile(path, buffer_size=BUFFER_BYTES, pre_buffer=False) as file:
-                for batch in file.iter_batches(CHUNK_ROWS, columns=list(wanted)):
-                    columns = {name: pa.chunked_array([batch.column(name)]) for name in wanted}
-                    share = (first - 1 + batch.num_rows) / file.metadata.num_rows
-                    yield Table(path.name, columns, first, share=share)
-                    first += batch.num_rows
-        except (pa.ArrowException, OSError) as error:
-            raise damaged(error) from None
+        # neither read_table nor a memory map: the one imports pandas, the other takes the file for memory
+        with one_line_errors(*damaged), pq.ParquetFile(path, buffer_size=BUFFER_BYTES, pre_buffer=False) as file:
+            for batch in file.iter_batches(CHUNK_ROWS, columns=list(wanted)):
+                columns = {name: pa.chunked_array([batch.column(name)]) for name in wanted}
+                share = (first - 1 + batch.num_rows) / file.metadata.num_rows
+                yield Table(path.name, columns, first, share=share)
+                first += batch.num_rows
 
     _check_footer(path)
-    try:
-        with pq.ParquetFile(path) as file:
-            check_width(path, file.metadata.num_columns)  # before anything is made of the columns
-            names = file.schema_arrow.names
-    except (pa.ArrowException, OSError) as error:
-        raise damaged(error) from None
+    with one_line_errors(*damaged), pq.ParquetFile(path) as file:
+        check_width(path, file.metadata.num_columns)  # before anything is made of the columns
+        names = file.schema_arrow.names
     count = Counter(names)
     return TableFile(path, tuple(name for name in names if count[name] == 1), read)
 

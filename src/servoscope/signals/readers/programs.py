@@ -12,10 +12,8 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import RecordingError
 from servoscope.signals.readers.clock import is_clock
-from servoscope.signals.readers.layout import check_names, find_table
-from servoscope.signals.readers.table import Table, TableFile, check_width, is_number, shorten_error
-
-HEAD_ROWS = 400  # that tell where the table of a sheet begins
+from servoscope.signals.readers.layout import HEAD_ROWS, check_names, find_table
+from servoscope.signals.readers.table import Table, TableFile, check_width, is_number, one_line_errors, shorten_error
 
 
 def open_sheet(path: Path) -> TableFile:
@@ -84,7 +82,7 @@ def open_lvm(path: Path) -> TableFile:
     import lvm_read
     import pyarrow as pa
 
-    try:
+    with one_line_errors(path, "is a damaged LVM file", "write it again, or save it as text"):
         read = lvm_read.read(str(path), read_from_pickle=False, dump_file=False)
         segment = read[0]
         names = [str(name) for name in segment["Channel names"]]
@@ -97,10 +95,6 @@ def open_lvm(path: Path) -> TableFile:
             step, begin = float(segment["Delta_X"][0]), float(segment["X0"][0])
             clock: FloatArray = begin + step * np.arange(len(data), dtype=np.float64)
             channels = {"X_Value": clock, **channels}
-    # it raises what its dictionaries and lists raise
-    except Exception as error:
-        text = shorten_error(error)
-        raise RecordingError(f"{path}: is a damaged LVM file ({text}), write it again, or save it as text") from None
     values = [name for name in channels if name != "X_Value"]
     named = {"X_Value": "time", **{n: f"{n} [{u}]" for n, u in zip(values, units, strict=False) if str(u).strip()}}
     check_names([named.get(name, name) for name in channels], str(path))

@@ -18,7 +18,12 @@ from servoscope.signals.readers.table import Table, TableFile
 
 BASE_S, BYTES_PER_S = 15.0, 5e5  # that a small file may take, and what is larger, by the clock on the wall
 LIMITS = ProcessLimits(cpu_s=1e6, memory_mb=8000.0, file_mb=1e6)  # a task's time is bound, not the process's
-LIBRARIES = ("pandas", "pyarrow", "h5py")  # what most readers use; Arrow looks for pandas at its first array
+LIBRARIES = (
+    "pandas",
+    "pyarrow",
+    "h5py",
+    "scipy.io",
+)  # what most readers use; Arrow looks for pandas at its first array
 
 _workers = Workers(LIMITS)  # kept, because starting one and loading its libraries takes a second
 atexit.register(_workers.close)

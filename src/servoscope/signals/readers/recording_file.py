@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -187,16 +186,18 @@ def _read_rows(
     columns = _without_reference(opened, columns, loop)
     chosen = RowFilter(opened, where)
     apart = None if by is None else CellReader(find_channel(by, known, f"{name}: by"))
-    keys = {"reference": columns.reference, "input": columns.input, "output": " and ".join(columns.outputs)}
     sensors = columns.outputs if len(columns.outputs) > 1 else ()
-    texts_by_key = {"reference": (columns.reference,), "input": (columns.input,), "output": columns.outputs}
-    texts_by_key |= {f"covariates.{covariate}": (text,) for covariate, text in columns.covariates.items()}
     of_plant = {} if loop is None else loop.plant.channels
-    carried = (*sensors, *columns.covariates, *of_plant)
-    labelled = {f"[columns] {key}": several for key, several in texts_by_key.items()}
-    labelled |= {f"[plant] {channel}": (text,) for channel, text in of_plant.items()}
+    texts_by_key = {
+        "[columns] reference": (columns.reference,),
+        "[columns] input": (columns.input,),
+        "[columns] output": columns.outputs,
+        **{f"[columns] covariates.{covariate}": (text,) for covariate, text in columns.covariates.items()},
+        **{f"[plant] {channel}": (text,) for channel, text in of_plant.items()},
+    }
     signals = {
-        key: [_parse_signal(opened, text, f"{name}: {key}") for text in several] for key, several in labelled.items()
+        key: [_parse_signal(opened, text, f"{name}: {key}") for text in several]
+        for key, several in texts_by_key.items()
     }
     unwrappers = {
         (name, period): Unwrapper(period)
@@ -211,12 +212,10 @@ def _read_rows(
     if clock is not None:
         wanted |= set(clock.columns)
         texts |= clock.texts
-    labels = {
-        letter: letter if letter == text else f"{letter} ({text!r})"
-        for letter, text in zip("ruy", keys.values(), strict=True)
-    }
-    target = _resample_target(columns, loop)
-    options = clock is not None, carried, loop, (labels["r"], labels["u"], labels["y"]), target
+    shown = {"r": columns.reference, "u": columns.input, "y": " and ".join(columns.outputs)}
+    r, u, y = (letter if letter == text else f"{letter} ({text!r})" for letter, text in shown.items())
+    carried = (*sensors, *columns.covariates, *of_plant)
+    options = clock is not None, carried, loop, (r, u, y), _resample_target(columns, loop)
     parts: dict[str, LoggedRows] = {}
     run = 0
     for table in opened.iter_chunks(wanted, texts):
@@ -229,20 +228,15 @@ def _read_rows(
             what: [_evaluate_signal(table, combination, what, unwrappers) for combination in several]
             for what, several in signals.items()
         }
-        values = [
-            several[0] if len(several) == 1 else np.mean(several, axis=0)
-            for several in itertools.islice(evaluated.values(), 3)
-        ]
+        *of_loop, outputs = [*evaluated.values()][:3]
+        values = [*(several[0] for several in of_loop), outputs[0] if len(outputs) == 1 else np.mean(outputs, axis=0)]
         if clock is not None:
             values.insert(0, clock.seconds(table))
         if segments:
             runs = run + np.cumsum(np.any([segment.changes(table) for segment in segments], axis=0))
             run = int(runs[-1])
             values.append(runs)
-        if sensors:
-            values += evaluated["[columns] output"]
-        values += [evaluated[f"[columns] covariates.{covariate}"][0] for covariate in columns.covariates]
-        values += [evaluated[f"[plant] {channel}"][0] for channel in of_plant]
+        values += [*(outputs if sensors else ()), *(several[0] for several in [*evaluated.values()][3:])]
         for value, mine in rows.items():
             if value not in parts:
                 parts[value] = LoggedRows(name if by is None else f"{name}[{by}={value}]", *options)
@@ -321,7 +315,7 @@ class LoggedRows:
         Raises RecordingError if their time stamps are unusable, or their rate is not the loop's.
         """
         if self._target is not None:
-            return self.recording()
+            return self._clean(*self.split_columns())
         (t, *signals), run, channels = self.split_columns()
         axis = build_time_axis(t, run, self._rate, self.name)
         r, u, y = map(axis.reorder, signals)
@@ -340,23 +334,18 @@ class LoggedRows:
         recording = self._clean([t, *signals], run, covariates)
         return replace(recording, began=began, zone="UTC" if log.is_utc else "") if began else recording
 
-    def recording(self) -> Recording:
-        """Return the rows cleaned."""
-        signals, run, covariates = self.split_columns()
-        return self._clean(signals, run, covariates)
-
     def _clean(self, signals: list[FloatArray], run: FloatArray | None, covariates: dict[str, FloatArray]) -> Recording:
-        t, r, u, y = signals
-        limits = self._loop.input_limits if self._loop is not None else None
-        notes = [self._note(*torn, t) for torn in self._broken]
-        options = {
-            "sample_rate": self._rate,
-            "run": run,
-            "limits": limits,
-            "labels": self._labels,
-            "channels": covariates,
-        }
-        recording = clean(t, r, u, y, name=self.name, target=self._target, **options)  # type: ignore[arg-type]
+        notes = [self._note(*torn, signals[0]) for torn in self._broken]
+        recording = clean(
+            *signals,
+            name=self.name,
+            sample_rate=self._rate,
+            run=run,
+            limits=None if self._loop is None else self._loop.input_limits,
+            labels=self._labels,
+            channels=covariates,
+            target=self._target,
+        )
         if not self._has_time:
             text = message("defect.no_time", rate=recording.sample_rate)
             notes.append(Defect("clock", float(recording.t[0]), float(recording.t[-1]), recording.samples, text))

@@ -13,11 +13,9 @@ from urllib.parse import quote
 
 import numpy as np
 
-from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.table import Table, TableFile, check_width, shorten_error
+from servoscope.signals.readers.table import CHUNK_ROWS, Table, TableFile, check_width, one_line_errors
 from servoscope.signals.readers.topics import MAX_ARRAY_LENGTH, open_bag
 
-ROWS_AT_ONCE = 1 << 16  # of a table of a database
 MAX_DEPTH = 6  # of records within records
 
 
@@ -26,7 +24,8 @@ def open_json(path: Path) -> TableFile:
     import pyarrow as pa
     import pyarrow.json as pj
 
-    try:
+    kinds = pa.ArrowException, ValueError, TypeError, AttributeError, RecursionError
+    with one_line_errors(path, "is no table in JSON", "write one record per line", kinds):
         with path.open("rb") as file:
             lines = file.readline().strip().endswith(b"}") and bool(file.readline().strip())
         if lines:
@@ -38,10 +37,6 @@ def open_json(path: Path) -> TableFile:
             content = {name: values for name, values in content.items() if isinstance(values, list)}
             return _open_frame(path, pa.table(content))
         return open_records(path, content)
-    except (pa.ArrowException, ValueError, TypeError, AttributeError, RecursionError) as error:
-        raise RecordingError(
-            f"{path}: is no table in JSON ({shorten_error(error)}), write one record per line"
-        ) from None
 
 
 def open_records(path: Path, records: Sequence[Mapping[str, Any]]) -> TableFile:
@@ -56,25 +51,18 @@ def open_feather(path: Path) -> TableFile:
     import pyarrow as pa
     import pyarrow.feather as pf
 
-    try:
+    kinds = pa.ArrowException, OSError, ValueError
+    with one_line_errors(path, "is a damaged Feather file", "write it again", kinds):
         return _open_frame(path, pf.read_table(path, memory_map=False))
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise RecordingError(f"{path}: is a damaged Feather file ({shorten_error(error)}), write it again") from None
 
 
 def open_numpy(path: Path) -> TableFile:
     """Open arrays of NumPy, ``.npz`` or ``.npy``: columns by name, fields of records, or columns of a matrix."""
     import pyarrow as pa
 
-    try:
-        with path.open("rb") as file:
-            loaded = np.load(file, allow_pickle=False)
-            arrays = {"": loaded} if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
-    # of headers that are damaged, or hold objects, it raises nearly anything
-    except Exception as error:
-        raise RecordingError(
-            f"{path}: holds no plain arrays ({shorten_error(error)}), save columns of numbers"
-        ) from None
+    with one_line_errors(path, "holds no plain arrays", "save columns of numbers"), path.open("rb") as file:
+        loaded = np.load(file, allow_pickle=False)
+        arrays = {"": loaded} if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
     columns = dict(pair for name, array in arrays.items() for pair in _array_columns(name, array))
     length = max(
         Counter(x.size for x in columns.values()).items(), key=lambda pair: (pair[1], pair[0]), default=(0, 0)
@@ -95,14 +83,12 @@ def _array_columns(name: str, array: Any) -> Iterator[tuple[str, Any]]:
 
 def open_sqlite(path: Path) -> TableFile:
     """Open a database of SQLite; of several tables columns are ``table.column``. A bag of ROS 2 is one too."""
-    try:
-        with closing(_connect(path)) as database:
-            names = [str(row[0]) for row in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
-            if {"topics", "messages"} <= set(names):
-                return open_bag(path, database)
-            tables = {name: _column_names(database, name) for name in names if not name.startswith("sqlite_")}
-    except sqlite3.Error as error:
-        raise RecordingError(f"{path}: is a damaged SQLite file ({shorten_error(error)}), export it again") from None
+    damaged = path, "is a damaged SQLite file", "export it again", (sqlite3.Error,)
+    with one_line_errors(*damaged), closing(_connect(path)) as database:
+        names = [str(row[0]) for row in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        if {"topics", "messages"} <= set(names):
+            return open_bag(path, database)
+        tables = {name: _column_names(database, name) for name in names if not name.startswith("sqlite_")}
     tables = {name: columns for name, columns in tables.items() if len(columns) > 1}
     places = {
         f"{name}.{column}" if len(tables) > 1 else column: (name, column)
@@ -112,19 +98,14 @@ def open_sqlite(path: Path) -> TableFile:
     check_width(path, len(places))
 
     def read_chunks(wanted: Sequence[str], _: Collection[str]) -> Iterator[Table]:
-        used = {places[name][0] for name in wanted}
-        if len(used) != 1:
-            raise RecordingError(f"{path}: {', '.join(sorted(used))} are different tables, take columns of one")
-        query = f"SELECT {', '.join(_quote(places[name][1]) for name in wanted)} FROM {_quote(used.pop())}"
-        try:
-            with closing(_connect(path)) as database:
-                rows, first = database.execute(query), 1
-                while piece := rows.fetchmany(ROWS_AT_ONCE):
-                    cells = zip(wanted, zip(*piece, strict=True), strict=True)
-                    yield Table(path.name, {name: _cell_column(column) for name, column in cells}, first)
-                    first += len(piece)
-        except sqlite3.Error as error:
-            raise RecordingError(f"{path}: cannot be read ({shorten_error(error)}), export it again") from None
+        table = places[wanted[0]][0]  # that of all of them
+        query = f"SELECT {', '.join(_quote(places[name][1]) for name in wanted)} FROM {_quote(table)}"
+        with one_line_errors(*damaged), closing(_connect(path)) as database:
+            rows, first = database.execute(query), 1
+            while piece := rows.fetchmany(CHUNK_ROWS):
+                cells = zip(wanted, zip(*piece, strict=True), strict=True)
+                yield Table(path.name, {name: _cell_column(column) for name, column in cells}, first)
+                first += len(piece)
 
     groups = tuple(tuple(name for name, (table, _) in places.items() if table == label) for label in tables)
     return TableFile(path, tuple(places), read_chunks, channel_groups=groups)

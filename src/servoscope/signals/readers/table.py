@@ -21,6 +21,8 @@ NULL_TEXTS = (
     *("", "NaN", "nan", "NAN", "-nan", "-NaN", "NA", "N/A", "#N/A", "#NA", "null", "NULL", "None", "-", "?"),
     "1.#QNAN",
 )
+SAMPLE_TOGETHER = "take columns of one table, topic or raster, or put them into one"
+CHUNK_ROWS = 1 << 16  # that are read at a time
 MAX_COLUMNS = 20_000  # of a file: beyond that the description of the columns is what fills the memory
 TIME_UNITS_BY_NAME = {"millitm": "ms", "msec": "ms", "ms": "ms", "milliseconds": "ms"}  # beside a time of day
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
@@ -240,11 +242,15 @@ class TableFile:
     def iter_chunks(self, wanted: Collection[str], texts: Collection[str] = ()) -> Iterator[Table]:
         """Yield the rows chunk by chunk, of the columns that are wanted; `texts` among them are text in any case.
 
-        Raises RecordingError if the file is damaged or has no rows.
+        Raises RecordingError if the file is damaged or has no rows, or not all of them were sampled together.
         """
         part = _part.get()
         rows, also = 0, {alias: name for alias, name in self.aliases.items() if alias in wanted}
-        places = {*wanted, *also.values()}
+        places = {*wanted, *also.values()} & {*self.columns}
+        together = max(map(set, self.channel_groups), key=lambda group: len(places & group), default=places)
+        if apart := sorted(places - together):
+            others = ", ".join(sorted(places & together))
+            raise RecordingError(f"{self.path}: {apart[0]!r} was not sampled together with {others}: {SAMPLE_TOGETHER}")
         for table in self.read_chunks([name for name in self.columns if name in places], texts):
             if part is not None and rows >= part.rows:
                 part.cut[self.name] = rows
@@ -292,6 +298,23 @@ def watch_reading(watch: Callable[[str, int, float], None]) -> Iterator[None]:
         yield
     finally:
         _watch.reset(before)
+
+
+@contextmanager
+def one_line_errors(
+    path: Path | str, what: str, advice: str = "", kinds: tuple[type[Exception], ...] = (Exception,)
+) -> Iterator[None]:
+    """Turn what a library raises at a damaged file into a RecordingError of one line.
+
+    `kinds`: of its errors; most libraries raise nearly anything. `what`, `advice`: what is wrong then, and the remedy.
+    """
+    try:
+        yield
+    except RecordingError:
+        raise
+    except kinds as error:
+        why = shorten_error(error) or type(error).__name__
+        raise RecordingError(f"{path}: {what} ({why}){advice and ', '}{advice}") from None
 
 
 def shorten_error(error: Exception) -> str:

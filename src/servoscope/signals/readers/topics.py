@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.table import Table, TableFile, check_width, shorten_error
+from servoscope.signals.readers.table import Table, TableFile, check_width, one_line_errors
 
 MAX_VALUES = 200_000_000  # of all topics together, which are held in memory
 MAX_ARRAY_LENGTH = 64  # values of one field, such as the joints of a robot; images and scans have more
@@ -30,18 +30,10 @@ def open_mcap(path: Path) -> TableFile:
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
-    try:
-        with path.open("rb") as file:
-            reader = make_reader(file, decoder_factories=[DecoderFactory()])
-            decoded = (
-                (channel.topic, m.log_time, message) for _, channel, m, message in reader.iter_decoded_messages()
-            )
-            return _open_messages(path, decoded)
-    except RecordingError:
-        raise
-    # the libraries raise nearly anything at damaged files
-    except Exception as error:
-        raise RecordingError(f"{path}: is a damaged MCAP file ({shorten_error(error)}), record it again") from None
+    with one_line_errors(path, "is a damaged MCAP file", "record it again"), path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        decoded = ((channel.topic, m.log_time, message) for _, channel, m, message in reader.iter_decoded_messages())
+        return _open_messages(path, decoded)
 
 
 def open_bag(path: Path, database: sqlite3.Connection) -> TableFile:
@@ -54,7 +46,7 @@ def open_bag(path: Path, database: sqlite3.Connection) -> TableFile:
     convert = "convert it to MCAP: ros2 bag convert -i FILE -o OPTIONS.yaml, with storage_id: mcap"
     if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'").fetchone():
         raise RecordingError(f"{path}: a bag without the definitions of its messages (ROS 2 before Iron), {convert}")
-    try:
+    with one_line_errors(path, "is a damaged bag", convert):
         texts = dict(database.execute("SELECT topic_type, encoded_message_definition FROM message_definitions"))
         topics = database.execute("SELECT id, name, type FROM topics").fetchall()
         factory: Any = DecoderFactory()
@@ -64,10 +56,6 @@ def open_bag(path: Path, database: sqlite3.Connection) -> TableFile:
             decoders[number] = topic, factory.decoder_for("cdr", schema)
         rows = database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp")
         return _open_messages(path, ((decoders[n][0], at, decoders[n][1](data)) for n, at, data in rows))
-    except RecordingError:
-        raise
-    except Exception as error:
-        raise RecordingError(f"{path}: is a damaged bag ({shorten_error(error)}), {convert}") from None
 
 
 def _open_messages(path: Path, messages: Iterable[tuple[str, int, Any]]) -> TableFile:
@@ -113,16 +101,13 @@ def open_ulog(path: Path) -> TableFile:
     """Open a ULog file of PX4; ``vehicle_attitude.q[0]`` is a field of a topic, ``topic/1.x`` of a second one."""
     from pyulog import ULog
 
-    try:
+    with one_line_errors(path, "is a damaged ULog file", "download it again"):
         log = ULog(str(path))
         topics = {}
         for dataset in log.data_list:
             name = dataset.name + (f"/{dataset.multi_id}" if dataset.multi_id else "")
             data = {field: np.asarray(x) for field, x in dataset.data.items() if np.asarray(x).dtype.kind in "fiub"}
             topics[name] = {"time": 1e-6 * data.pop("timestamp"), **data}
-    # it raises what reading beyond the end, or of a format that is none, raises
-    except Exception as error:
-        raise RecordingError(f"{path}: is a damaged ULog file ({shorten_error(error)}), download it again") from None
     return _open_topics(path, topics)
 
 
@@ -138,11 +123,6 @@ def _open_topics(path: Path, topics: Topics) -> TableFile:
     def read_chunks(wanted: Sequence[str], _: Collection[str]) -> Iterator[Table]:
         import pyarrow as pa
 
-        used = {columns[label][0] for label in wanted}
-        if len(used) > 1:
-            raise RecordingError(
-                f"{path}: {', '.join(sorted(used))} were not sampled together: log them in one topic, or resample them"
-            )
         values = {label: full[columns[label][0]][columns[label][1]] for label in wanted}
         yield Table(path.name, {label: pa.chunked_array([np.ascontiguousarray(x)]) for label, x in values.items()})
 
