@@ -92,11 +92,6 @@ class DetectableChange(BaselineModel):
     parameter: str
     change: float | None
 
-    def or_smaller(self, change: float) -> Self:
-        """Return the smaller of this change and another one, which may be infinite."""
-        smallest = min(np.inf if self.change is None else self.change, change)
-        return self.model_copy(update={"change": smallest if np.isfinite(smallest) else None})
-
 
 class ExactPredictorFit(BaselineModel):
     """What the exact predictor, of which the refit makes use, says of the healthy recordings."""

@@ -118,13 +118,11 @@ def _learn_model(layout: ResidualLayout, pipeline: Pipeline, recordings: Sequenc
 def _left_out_ratios(layout: ResidualLayout, healthy: HealthyRecordings) -> FloatArray:
     """Return the ratios of each recording, shape (n, 2), by means and scatter of recordings that do not hold it."""
     recordings, pipeline = healthy.recordings, healthy.pipeline
-    fold = np.arange(len(recordings)) % MAX_FOLDS
-    ratios = np.empty((len(recordings), 2))
-    for k in range(min(MAX_FOLDS, len(recordings))):
-        model = _learn_model(layout, pipeline, [rec for rec, own in zip(recordings, fold, strict=True) if own != k])
-        for i in np.flatnonzero(fold == k).tolist():
-            ratios[i] = model.ratios_of(pipeline, recordings[i])
-    return ratios
+    models = [
+        _learn_model(layout, pipeline, [rec for i, rec in enumerate(recordings) if i % MAX_FOLDS != k])
+        for k in range(min(MAX_FOLDS, len(recordings)))
+    ]
+    return np.array([models[i % MAX_FOLDS].ratios_of(pipeline, rec) for i, rec in enumerate(recordings)])
 
 
 RESIDUAL = EvidenceKind("residual", _learn)

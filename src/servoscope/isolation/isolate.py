@@ -126,10 +126,8 @@ class _SignatureSearch:
 
     def _covariance(self, x: float, s: FloatArray) -> FloatArray:
         # an angle is off the curve: along it the size is free as it is
-        across = (s @ s) * np.eye(len(s)) - np.outer(s, s)
-        angle = self.signature.angle * np.ones_like(s)
-        off = (SYSTEMATIC_ERROR_SHARE * s) ** 2 + 1e-12
-        Sigma = self.correlation + np.diag(off) + np.outer(angle, angle) * across
+        angle, off = self.signature.angle * np.ones_like(s), (SYSTEMATIC_ERROR_SHARE * s) ** 2 + 1e-12
+        Sigma = self.correlation + np.diag(angle**2 * (s @ s) + off) - np.outer(angle * s, angle * s)
         if self.signature.scatter is not None:
             Sigma = Sigma + self.signature.scatter(x) / np.outer(self.size, self.size)
         return np.asarray(Sigma)

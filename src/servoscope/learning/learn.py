@@ -196,10 +196,11 @@ def _with_pressures(baseline: Baseline, healthy: HealthyRecordings) -> Baseline:
         notes = (*notes, message("learning.no_pressures", needed=MIN_RECORDINGS_OF_RESIDUAL))
     if residual is not None and residual.halves:
         sizes.append(residual.detectable_changes(baseline.fault_directions, np.array(residual.halves)))
-    changes = baseline.detectability.changes
-    for own in sizes:
-        changes = tuple(change.or_smaller(own.get(change.parameter, np.inf)) for change in changes)
-    detectability = baseline.detectability.model_copy(update={"changes": changes})
+    changes = []
+    for change in baseline.detectability.changes:
+        known = [change.change or np.inf, *(own.get(change.parameter, np.inf) for own in sizes)]
+        changes.append(change.model_copy(update={"change": min(filter(np.isfinite, known), default=None)}))
+    detectability = baseline.detectability.model_copy(update={"changes": tuple(changes)})
     return baseline.model_copy(update={"pressures": model, "detectability": detectability, "notes": notes})
 
 

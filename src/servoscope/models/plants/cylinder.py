@@ -13,8 +13,6 @@ from servoscope.models.plants.base import Fault, StateSpace, read_translations
 from servoscope.models.plants.columns import Column
 from servoscope.models.plants.terms import TERM_TUPLE, UNIQUE_TERMS, TermColumn, TermPlant
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 TermName = Literal["jerk", "spring", "process", "droop", "overlap", "leakage", "offset"]
 
 CHANNELS = "p_A", "p_B", "p_S"  # of logged pressures, in a recording
@@ -137,7 +135,7 @@ class CylinderPlant(TermPlant):
         "offset",
     )
     # output beyond which the force of the term ``process`` acts
-    contact: Finite | None = None
+    contact: Annotated[float | None, Field(allow_inf_nan=False)] = None
     # columns of the pressures at both sides of the piston, and of the supply: A is the side that u > 0 fills
     pressures: Annotated[Pressures, Field(exclude_if=lambda value: value is None)] | None = None
 
@@ -145,9 +143,6 @@ class CylinderPlant(TermPlant):
     def _consistent(self) -> Self:
         if ("process" in self.terms) != (self.contact is not None):
             raise ValueError("contact: belongs to the term process, give both or none of them")
-        if self.coefficients is not None and set(self.coefficients) != set(self.names):
-            wrong = ", ".join(sorted(set(self.coefficients) ^ set(self.names)))
-            raise ValueError(f"coefficients: give each of {', '.join(self.names)}; check {wrong}")
         return self
 
     @property
@@ -173,22 +168,6 @@ class CylinderPlant(TermPlant):
     def column_shapes(self) -> Mapping[Column, tuple[float, float]]:
         """Where the process force begins."""
         return {Column.SPEED_BEYOND: (self.contact or 0.0, 0.0)}
-
-    @property
-    def coefficient_units(self) -> tuple[str, ...]:
-        """Units of the coefficients."""
-        of_u = "u" if self.input_gain == 1.0 else "input_gain u"
-        units = {0: f"{of_u}/y", 2: f"{of_u} s²/y", 3: f"{of_u} s³/y"}
-        extras = {
-            Column.SPEED_POSITION: f"{of_u} s/y²",
-            Column.SPEED_SQUARED: f"{of_u} s²/y²",
-            Column.SIGN: of_u,
-            Column.CONSTANT: of_u,
-        }
-        return tuple(
-            units[column.column] if isinstance(column.column, int) else extras.get(column.column, f"{of_u} s/y")
-            for column in self.columns
-        )
 
     @property
     def unwatched(self) -> tuple[str, ...]:
