@@ -11,7 +11,7 @@ from tables import Table, parser, show
 import servoscope as ss
 from accuracy.noisy_output import RATE, TRUE, drive
 from servoscope.core.arrays import FloatArray
-from servoscope.estimation.instrumental_fit import fit_with_instrument
+from servoscope.fit.instrumental_fit import fit_with_instrument
 from servoscope.learning.inspection.delay_fit import COEFFICIENT_LOG_STD, DelaySearch
 from servoscope.learning.recursion import tune_pipeline
 

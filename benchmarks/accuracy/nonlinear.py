@@ -23,7 +23,7 @@ from tables import Table, parser, show
 import servoscope as ss
 from servoscope.core.errors import RecordingError
 from servoscope.estimation.pipeline import Pipeline
-from servoscope.estimation.tuning import least_squares
+from servoscope.fit.tuning import least_squares
 from servoscope.simulation import FaultEvent, Rig, RigTruth, reference, simulate_rig
 
 RIG_FILE = Path(str(files("servoscope"))) / "simulation" / "reference-rig.toml"

@@ -20,12 +20,13 @@ import numpy as np
 from tables import Table, parser, show
 
 import servoscope as ss
+from public.fault_indices import FaultIndices, fault_indices
 from public.pitch_turbine import DYNAMICS, ONSET_S, RAMP_S, RATE, SENSOR_KINDS, SENSORS, measure, ray
 from servoscope.baseline.sensors import find_sensor_deviation
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.evidence.sensors import wrong_sensor
-from servoscope.scoring import FaultIndices, alarm_rate, events, fault_indices
+from servoscope.scoring import alarm_rate, events
 
 LEARNED_S, CASE_S, HOUR_S = 600.0, 600.0, 3600.0
 TRAINING = 5  # winds

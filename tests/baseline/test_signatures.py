@@ -11,7 +11,7 @@ import pytest
 from servoscope.baseline.expectation import Expectation, WhiteNoise, reference_path
 from servoscope.detection.statistic import t2_statistic
 from servoscope.estimation.pipeline import Pipeline, Regression, Tuning
-from servoscope.estimation.tuning import fit_tuning, least_squares
+from servoscope.fit.tuning import fit_tuning, least_squares
 from servoscope.models.loop import Loop
 from servoscope.models.lti import solve_scaled
 from servoscope.signals import clean

@@ -15,7 +15,7 @@ from servoscope.baseline.threshold import SECONDS_PER_YEAR, threshold
 from servoscope.detection.onset import estimate_onset
 from servoscope.detection.statistic import noncentrality, required_noncentrality, t2_statistic, whiten
 from servoscope.estimation.pipeline import Pipeline, Tuning
-from servoscope.estimation.tuning import fit_tuning
+from servoscope.fit.tuning import fit_tuning
 from servoscope.models.loop import Loop
 from servoscope.simulation import FaultEvent, reference, simulate
 

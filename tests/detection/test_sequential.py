@@ -25,7 +25,7 @@ from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.kernel.cusum import LAGS, whitening_filter
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.estimation.pipeline import Estimates, Pipeline
-from servoscope.estimation.tuning import fit_tuning
+from servoscope.fit.tuning import fit_tuning
 from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording

@@ -10,7 +10,7 @@ import pytest
 
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.pipeline import Pipeline
-from servoscope.estimation.tuning import fit_tuning, least_squares
+from servoscope.fit.tuning import fit_tuning, least_squares
 from servoscope.models.loop import Loop
 from servoscope.signals.readers import read
 from servoscope.simulation import reference, simulate_response

@@ -21,7 +21,7 @@ from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.estimation import estimators
 from servoscope.estimation.pipeline import Pipeline, Tuning
 from servoscope.estimation.recursion import Recursion, RecursionConstants
-from servoscope.estimation.tuning import fit_tuning
+from servoscope.fit.tuning import fit_tuning
 from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Loop
 from servoscope.signals.readers import read

@@ -13,9 +13,9 @@ from scipy.signal import lfilter
 
 import servoscope as ss
 from servoscope.core.errors import RecordingError
-from servoscope.estimation.instrumental_fit import fit_with_instrument
 from servoscope.estimation.pipeline import Pipeline
-from servoscope.estimation.tuning import least_squares
+from servoscope.fit.instrumental_fit import fit_with_instrument
+from servoscope.fit.tuning import least_squares
 from servoscope.learning.instrument import source_of
 from servoscope.signals import Recording, clean
 

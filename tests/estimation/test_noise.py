@@ -17,13 +17,13 @@ from servoscope.estimation.noise_model import (
     ArmaNoise,
     WhiteNoise,
     arma_from_white_noise,
-    fit_white_noise,
     residual_system,
     sample_autocovariance,
     yule_walker,
 )
 from servoscope.estimation.pipeline import Pipeline
-from servoscope.estimation.tuning import prefers_white_noise
+from servoscope.fit.tuning import prefers_white_noise
+from servoscope.fit.white_noise import fit_white_noise
 from servoscope.models.loop import Loop
 from servoscope.models.lti import LinearSystem, autocovariances
 

@@ -19,7 +19,7 @@ from servoscope.detection.trace import Trace
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.estimation.pipeline import Estimates, Pipeline, Tuning
 from servoscope.estimation.recursion import EvaluationConstants
-from servoscope.estimation.tuning import fit_tuning
+from servoscope.fit.tuning import fit_tuning
 from servoscope.learning.learn import learn_baseline
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording

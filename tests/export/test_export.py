@@ -300,7 +300,7 @@ class TestSinglePrecision:
     def test_its_error_is_said_and_refused_where_it_is_too_large(self, monkeypatch: pytest.MonkeyPatch) -> None:
         found = re.search(r"a factor of ([\d.]+) in the rate", export_c(demo(), single=True).files["servo_monitor.h"])
         assert found and 1.0 <= float(found[1]) < 1.1
-        monkeypatch.setattr("servoscope.export.precision.MAX_FACTOR", 1.0)
+        monkeypatch.setattr("servoscope.export.golden.MAX_FACTOR", 1.0)
         with pytest.raises(BaselineError, match="in single precision T"):
             export_c(demo(), single=True)
 

@@ -22,7 +22,7 @@ COEFFICIENTS = {"inertia": 2.0, "viscous_friction": 1.0, "coulomb_friction": 0.6
 
 
 def fit(values: list[float], covariance: np.ndarray) -> AxisFit:
-    return AxisFit(np.array(values), covariance, 0.0, 1000)
+    return AxisFit(np.array(values), covariance)
 
 
 def swing(seed: int, seconds: float = 12.0) -> tuple[ss.Loop, ss.Recording]:

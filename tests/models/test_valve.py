@@ -14,8 +14,8 @@ from servoscope.core.errors import LoopError, SimulationError
 from servoscope.diagnosis.diagnose import diagnose
 from servoscope.diagnosis.monitor import Monitor
 from servoscope.estimation.pipeline import Pipeline
-from servoscope.estimation.tuning import least_squares
 from servoscope.estimation.valve import ValveLaw
+from servoscope.fit.tuning import least_squares
 from servoscope.models.loop import Loop
 from servoscope.models.lti import sample_system, state_variable_filter
 from servoscope.signals import Recording

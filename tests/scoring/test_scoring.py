@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from public.fault_indices import FaultIndices, fault_indices
 from scipy import stats
 from statsmodels.stats.multitest import multipletests
 from statsmodels.stats.proportion import proportion_confint
@@ -229,30 +230,30 @@ class TestFaultIndices:
         t = np.arange(10.0)
         shown = bools("#...#.####")  # one false second of 4; the fault is there from 4 to 10 s, shown for 5 of 6 s
         named = ["x", "", "", "", "y", "", "y", "x", "x", "x"]
-        found = scoring.fault_indices(t, shown, named, "x", 4.0)
-        assert found == scoring.FaultIndices(t_dt=2.0, r_fd=0.25, r_td=5 / 6, r_fi=2 / 6, r_ti=3 / 6, t_it=3.0)
+        found = fault_indices(t, shown, named, "x", 4.0)
+        assert found == FaultIndices(t_dt=2.0, r_fd=0.25, r_td=5 / 6, r_fi=2 / 6, r_ti=3 / 6, t_it=3.0)
 
     def test_what_does_not_last_is_no_detection(self) -> None:
-        found = scoring.fault_indices(np.arange(4.0), bools(".##."), ["", "x", "x", ""], "x", 1.0)
+        found = fault_indices(np.arange(4.0), bools(".##."), ["", "x", "x", ""], "x", 1.0)
         assert np.isinf([found.t_dt, found.t_it]).all()
         assert found.r_td == pytest.approx(2 / 3)
 
     def test_decisions_after_its_end_do_not_count(self) -> None:
-        found = scoring.fault_indices(np.arange(6.0), bools("..##.."), ["", "", "x", "x", "", ""], "x", 2.0, 4.0)
-        assert found == scoring.FaultIndices(0.0, 0.0, 1.0, 0.0, 1.0, 0.0)
+        found = fault_indices(np.arange(6.0), bools("..##.."), ["", "", "x", "x", "", ""], "x", 2.0, 4.0)
+        assert found == FaultIndices(0.0, 0.0, 1.0, 0.0, 1.0, 0.0)
 
     def test_without_a_time_before_there_is_no_false_rate(self) -> None:
-        assert np.isnan(scoring.fault_indices([0.0, 1.0], bools("##"), ["x", "x"], "x", 0.0).r_fd)
+        assert np.isnan(fault_indices([0.0, 1.0], bools("##"), ["x", "x"], "x", 0.0).r_fd)
 
     def test_a_fault_that_nobody_looked_at_is_refused(self) -> None:
         with pytest.raises(ValueError, match="no decision from 9 to 10 s"):
-            scoring.fault_indices([0.0, 1.0], bools(".."), ["", ""], "x", 9.0, 10.0)
+            fault_indices([0.0, 1.0], bools(".."), ["", ""], "x", 9.0, 10.0)
 
     @given(st.text("#.", min_size=2, max_size=40), st.integers(0, 30))
     def test_shares_are_shares_and_a_lasting_detection_is_one_at_the_end(self, text: str, onset: int) -> None:
         shown, t = bools(text), np.arange(float(len(text)))
         if onset < len(text):
-            found = scoring.fault_indices(t, shown, ["x" if on else "" for on in shown], "x", float(onset))
+            found = fault_indices(t, shown, ["x" if on else "" for on in shown], "x", float(onset))
             assert 0.0 <= found.r_td <= 1.0
             assert found.r_ti == found.r_td
             assert np.isfinite(found.t_dt) == shown[-1]

@@ -13,9 +13,9 @@ from servoscope.core.arrays import FloatArray
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.noise_model import ArmaNoise, WhiteNoise, sample_autocovariance
 from servoscope.estimation.pipeline import Pipeline, Regression
-from servoscope.estimation.tuning import TuningFit
 from servoscope.fit import search
 from servoscope.fit.search import Experiment
+from servoscope.fit.tuning import TuningFit
 from servoscope.models.loop import Loop
 from servoscope.models.lti import autocovariances, solve_scaled
 from servoscope.models.plants import Plant

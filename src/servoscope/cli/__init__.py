@@ -15,10 +15,8 @@ from servoscope.cli import (  # their commands add themselves to the application
     fleet,
     init,
     recordings,
-    relearn,
     service,
     simulate_design,
-    store,
     trend,
     web,
 )
@@ -38,10 +36,8 @@ __all__ = [
     "init",
     "main",
     "recordings",
-    "relearn",
     "service",
     "simulate_design",
-    "store",
     "trend",
     "web",
 ]

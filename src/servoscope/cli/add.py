@@ -12,6 +12,7 @@ import typer
 
 from servoscope.cli.app import app
 from servoscope.cli.service import prefix_file_name
+from servoscope.core.messages import say
 
 REPLAY = '[sources.recordings]\nkind = "replay"\nspeed = 0.0  # as fast as possible\n'
 
@@ -34,7 +35,6 @@ def add(
     from servoscope.core.errors import ConfigError
     from servoscope.core.files import atomic_write
     from servoscope.core.settings import parse_toml, read_toml_text
-    from servoscope.report.page import say
     from servoscope.service.build import check_service_file
     from servoscope.service.config import ServiceFile
 

@@ -14,7 +14,8 @@ import typer
 from servoscope.cli.examples import EXAMPLES
 from servoscope.cli.exit import CommandGroup
 from servoscope.core.cache_folders import replace_library_warnings
-from servoscope.core.errors import ObsoleteSettingWarning
+from servoscope.core.errors import ObsoleteSettingWarning, OutputError
+from servoscope.core.messages import say, set_language
 
 _format_library_warning = warnings.formatwarning
 
@@ -80,8 +81,6 @@ def _print_version(wanted: bool) -> None:
 
 
 def _choose_language(name: str | None) -> None:
-    from servoscope.core.messages import set_language
-
     if name is not None:
         try:
             set_language(name)
@@ -122,9 +121,6 @@ def show_docs() -> None:
     from functools import partial
     from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
     from pathlib import Path
-
-    from servoscope.core.errors import OutputError
-    from servoscope.report.page import say
 
     page = Path(__file__).parent.parent / "site" / "index.html"
     if not page.is_file():

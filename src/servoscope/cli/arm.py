@@ -12,6 +12,9 @@ import typer
 from servoscope.cli.app import app
 from servoscope.cli.exit import EXIT_FAULT, FailureCounter, print_json
 from servoscope.cli.output_paths import OutputPaths, check_output
+from servoscope.core.errors import BaselineError, OutputError
+from servoscope.core.files import atomic_write
+from servoscope.core.messages import render, say
 
 if TYPE_CHECKING:
     from servoscope.baseline.arm import ArmBaseline
@@ -29,11 +32,7 @@ def write_proposal(logs: Sequence[Path], urdf: Path, output: Path, replace: bool
     import os
 
     from servoscope.cli.render import results
-    from servoscope.core.errors import OutputError
-    from servoscope.core.files import atomic_write
-    from servoscope.core.messages import render
     from servoscope.learning.arm_setup import propose_arm_loop
-    from servoscope.report.page import say
 
     if output.exists() and not replace:
         raise OutputError(f"{output}: exists; name another file with -o, or replace it with --yes")
@@ -59,10 +58,7 @@ def calibrate(
 
     from servoscope.baseline.arm import ArmBaseline
     from servoscope.cli.render import results
-    from servoscope.core.errors import BaselineError
-    from servoscope.core.files import atomic_write
     from servoscope.learning.arm_setup import calibrate_load
-    from servoscope.report.page import say
     from servoscope.signals.readers.arm_log import read_arm_log
 
     if (healthy := ArmBaseline.load(baseline)) is None:
@@ -112,7 +108,6 @@ def learn_baseline(loop: Path, logs: Sequence[Path], output: Path, as_json: bool
 
 def _print_baseline(baseline: ArmBaseline) -> None:
     from servoscope.cli.render import results
-    from servoscope.report.page import say
 
     out = results.create_console()
     summary = baseline.summary()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import re
 import shlex
+import textwrap
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
@@ -16,6 +18,7 @@ from rich.text import Text
 from servoscope.core.files import atomic_write, make_folder
 
 WIDTH = 80
+NO_BREAK = "\N{NO-BREAK SPACE}"
 COEFFICIENTS = (
     "theta_0 ... theta_3 are the coefficients of s^0 ... s^3 of the inverse: the current u (A) that the "
     "position y (m) and its three derivatives ask for, in A/m, A s/m, A s²/m and A s³/m."
@@ -107,19 +110,13 @@ def run_demo(folder: Path, run: Callable[[Sequence[str]], object]) -> None:
 
 
 def _format_command(step: DemoStep) -> str:
-    """Return the command as one would type it, broken where it is too long for a line."""
-    words = [shlex.quote(word) for word in ("servoscope", *step.arguments)]
+    """Return the command as a terminal of 80 columns shows it; an option stays with its value."""
+    words = " ".join(shlex.quote(word).replace(" ", NO_BREAK) for word in ("servoscope", *step.arguments))
     if step.output is not None:
-        words.append(f"> {shlex.quote(str(step.output))}")
-    lines = ["$"]
-    for i, word in enumerate(words):
-        value = i + 1 < len(words) and word.startswith("-") and not words[i + 1].startswith(("-", ">"))
-        needed = len(f"{word} {words[i + 1]}") if value else len(word)  # an option stays with its value
-        if len(lines[-1]) + needed + 3 > WIDTH and len(lines[-1].split()) > 1:
-            lines[-1] += " \\"
-            lines.append("   ")
-        lines[-1] += f" {word}"
-    return "\n".join(lines)
+        words += f" >{NO_BREAK}{shlex.quote(str(step.output)).replace(' ', NO_BREAK)}"
+    kept = re.sub(r"(?<= )(-\S+) (?![->])", rf"\1{NO_BREAK}", words)
+    lines = textwrap.wrap(f"$ {kept}", WIDTH - 2, subsequent_indent="    ", break_on_hyphens=False)
+    return " \\\n".join(lines).replace(NO_BREAK, " ")
 
 
 def _exit_on_failure(code: object) -> None:

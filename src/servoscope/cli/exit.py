@@ -14,6 +14,7 @@ import typer
 import typer.core
 
 from servoscope.core.errors import ServoscopeError
+from servoscope.core.messages import say
 
 SERVICE_MODULES = (
     "sqlalchemy",
@@ -29,8 +30,6 @@ class CommandGroup(typer.core.TyperGroup):
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return a command by its name; of one that is gone, say what took its place."""
         if cmd_name == "explore":  # until 2.0
-            from servoscope.report.page import say
-
             raise ServoscopeError(say("init.explore"))
         return super().get_command(ctx, cmd_name)
 

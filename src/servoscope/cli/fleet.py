@@ -12,6 +12,7 @@ from servoscope.cli import arguments
 from servoscope.cli.app import app
 from servoscope.cli.exit import EXIT_FAULT, print_json
 from servoscope.cli.options import ColumnsOption, JsonOption, with_options
+from servoscope.cli.progress import show_count, show_spinner
 
 if TYPE_CHECKING:
     from pyspark.sql import SparkSession
@@ -93,7 +94,6 @@ def fleet(
     if len(keys) != 2 or not all(keys):
         raise typer.BadParameter(f"--partition {partition!r}: write two names, as in asset,day")
 
-    from servoscope.cli.progress import show_count
     from servoscope.fleet import Lake, Plan, run
     from servoscope.fleet.lake import read_groups
     from servoscope.fleet.sinks import write_stream_report
@@ -126,10 +126,9 @@ def fleet(
     if as_json:
         print_json(result.to_dict(), lines=False)
     else:
-        from servoscope.cli.render import fleet as fleets
-        from servoscope.cli.render import results
+        from servoscope.cli.render import fleet, results
 
-        fleets.print_fleet(results.create_console(), result)
+        fleet.print_fleet(results.create_console(), result)
         results.print_written_path(results.create_console(), output / "report.html")
     if fail_on_fault and (result.count("fault") or result.accepted):
         raise typer.Exit(EXIT_FAULT)
@@ -154,7 +153,6 @@ def _follow(
     master: str | None,
 ) -> SparkSession:
     """Follow what comes in: all there is, or on and on until interrupted; return the session."""
-    from servoscope.cli.progress import show_spinner
     from servoscope.fleet import sinks
     from servoscope.fleet.baselines import Baselines
     from servoscope.fleet.spark import session

@@ -15,6 +15,8 @@ from servoscope.cli.exit import FailureCounter
 from servoscope.cli.options import ReadingOptions, with_reading_options
 from servoscope.cli.output_paths import check_output
 from servoscope.cli.progress import show_steps
+from servoscope.core.errors import OutputError, ServoscopeError
+from servoscope.core.messages import render, say
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -45,9 +47,7 @@ def init(
         return
 
     from servoscope.cli.render import results
-    from servoscope.core.errors import OutputError, ServoscopeError
     from servoscope.learning.proposal import PART_ROWS, propose_columns
-    from servoscope.report.page import say
     from servoscope.signals import readers
     from servoscope.signals.readers.axes import find_axes
     from servoscope.signals.readers.table import read_part
@@ -98,11 +98,8 @@ def _axis_file(output: Path, axis: str | None) -> Path:
 def _propose(out: Console, logs: list[Path], columns: Columns, output: Path, asks: bool, where: dict[str, str]) -> None:
     """Print the proposal for logs with its evidence, write it, and inspect the logs with it."""
     from servoscope.cli.render import results
-    from servoscope.core.errors import ServoscopeError
-    from servoscope.core.messages import render
     from servoscope.learning import inspection
     from servoscope.learning.proposal import propose_loop
-    from servoscope.report.page import say
     from servoscope.signals import readers
 
     with show_steps(1, 1) as steps:

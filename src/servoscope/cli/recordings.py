@@ -23,6 +23,7 @@ from servoscope.cli.options import (
 )
 from servoscope.cli.output_paths import REPORTS, TRACES, OutputPaths, check_output
 from servoscope.cli.progress import StepProgress, show_steps
+from servoscope.core.messages import say
 
 if TYPE_CHECKING:
     from servoscope.baseline.baseline import Baseline
@@ -330,7 +331,6 @@ def verify(
     from servoscope.core.errors import RecordingError
     from servoscope.diagnosis import verify as verification
     from servoscope.report import plain_values
-    from servoscope.report.page import say
 
     told = verification.load_diagnosis(diagnosis)
     learned = Baseline.load(baseline)

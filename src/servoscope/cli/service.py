@@ -1,4 +1,4 @@
-"""The commands of the service: run it, watch it, print its history, replay recordings to it."""
+"""The commands of the service: run it, watch it, print its history, back up its store, replay recordings to it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -21,7 +21,7 @@ from servoscope.cli.exit import EXIT_INTERRUPTED, print_json
 from servoscope.cli.options import JsonOption
 from servoscope.cli.output_paths import check_output
 from servoscope.core.errors import ConfigError, ObsoleteSettingWarning, StoreError
-from servoscope.core.messages import count_words, message, render
+from servoscope.core.messages import count_words, say
 from servoscope.core.settings_errors import suggest_name
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ def run(
             lines = check_service_file(settings)
         counts = {"asset": len(settings.assets), "source": len(settings.sources)}
         counted = ", ".join(count_words(count, noun) for noun, count in counts.items())
-        typer.echo(render(message("cli.usable_file", path=str(config), counted=counted)))
+        typer.echo(say("cli.usable_file", path=str(config), counted=counted))
         for line in lines:
             typer.echo(line)
         if online:
@@ -142,14 +142,13 @@ def watch(
     as_json: JsonOption = False,
 ) -> None:
     """Show assets as they are now: verdict, since when, residuals, alarms; read from the store."""
-    from servoscope.cli.render import history as tables
-    from servoscope.cli.render import results
+    from servoscope.cli.render import history, results
 
     opened, out = open_store(store, asset or ()), results.create_console()
 
     def page() -> Group:
         try:
-            return tables.status_page(opened.statuses(asset), out.width)
+            return history.status_page(opened.statuses(asset), out.width)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise StoreError(f"{store}: holds a damaged status ({error!r}), restore a backup of the store") from None
 
@@ -189,8 +188,7 @@ def history(
     check_output(output, "-o", EXPORTS, [])
     span = parse_time(since, "--from"), parse_time(until, "--to")
 
-    from servoscope.cli.render import history as tables
-    from servoscope.cli.render import results
+    from servoscope.cli.render import history, results
     from servoscope.service.store.queries import query_history, with_time_text
 
     shown = last if last is not None or as_json or output is not None else DEFAULT_ROWS
@@ -203,17 +201,16 @@ def history(
         for row in rows:
             print_json(with_time_text(row), lines=True)
     else:
-        results.create_console().print(tables.row_table(rows, COLUMNS[kind]))
+        results.create_console().print(history.row_table(rows, COLUMNS[kind]))
 
 
 def commission(settings: ServiceFile, seconds: float) -> None:
     """Print how each asset is heard; exit with 1 if one is not as its loop needs it."""
-    from servoscope.cli.render import history as tables
-    from servoscope.cli.render import results
+    from servoscope.cli.render import history, results
     from servoscope.service.commissioning import listen
 
     rows = listen(settings, seconds)
-    results.create_console().print(tables.commissioning_table(rows))
+    results.create_console().print(history.commissioning_table(rows))
     if any(row.reception.state != "followed" for row in rows):
         raise typer.Exit(1)
 
@@ -289,3 +286,38 @@ def publish(
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: publisher.stop())
     publisher.run()
+
+
+store_app = typer.Typer(no_args_is_help=True, help="Back up a history, and restore it.")
+app.add_typer(store_app, name="store")
+
+
+@store_app.command()
+def backup(
+    store: StoreArgument,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write; it must not exist yet.")],
+) -> None:
+    """Write all that a store holds at this moment into a file, which is a store itself; services may go on."""
+    from servoscope.service.store.copy import copy_store
+
+    with closing(open_store(store)) as opened:
+        _print_counts(file, copy_store(opened, str(file.absolute())))
+
+
+@store_app.command()
+def restore(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="What backup has written.")], store: StoreArgument
+) -> None:
+    """Bring a backup into a store that has no history yet: a new SQLite file, or an empty PostgreSQL database."""
+    from servoscope.service.store.copy import copy_store
+    from servoscope.service.store.engine import display_url, parse_store_url
+
+    url, folder = parse_store_address(store)
+    with closing(open_store(str(file))) as opened:
+        counts = copy_store(opened, url, folder)
+    _print_counts(display_url(parse_store_url(url, folder or Path())), counts)
+
+
+def _print_counts(where: str | Path, counts: dict[str, int]) -> None:
+    rows, states = sum(counts.values()), counts.get("checkpoints", 0)
+    typer.echo(f"{where}: {count_words(rows, 'row', 'en')}, {count_words(states, 'saved_state', 'en')}")

@@ -21,6 +21,7 @@ from servoscope.cli.output_paths import RECORDINGS, REPORTS, check_output
 from servoscope.cli.progress import show_steps
 from servoscope.core.errors import LoopError
 from servoscope.core.files import atomic_write, exclusive_folder
+from servoscope.core.messages import say
 
 if TYPE_CHECKING:
     from servoscope.design import BaselineStudy
@@ -103,8 +104,7 @@ def design(
     arguments.check_reference(reference)
 
     from servoscope.baseline.baseline import Baseline
-    from servoscope.cli.render import design as studies
-    from servoscope.cli.render import results
+    from servoscope.cli.render import design, results
     from servoscope.design import DesignStudy, design_study, study_baseline
     from servoscope.models.loop import Loop
     from servoscope.report import plain_values
@@ -133,9 +133,9 @@ def design(
     if as_json:
         print_json(plain_values.to_plain_values(study), lines=False)
     elif isinstance(study, DesignStudy):
-        studies.print_study(results.create_console(), study)
+        design.print_study(results.create_console(), study)
     else:
-        studies.print_learned_study(results.create_console(), study)
+        design.print_learned_study(results.create_console(), study)
     if report is not None:
         if not isinstance(study, DesignStudy):
             raise LoopError(f"{loop}: no page without a simulation of the loop: {study.missing}")
@@ -191,7 +191,6 @@ def tutorial(
 ) -> None:
     """Write the four logs that the tutorial reads: a motor axis, healthy on three days and faulty on Friday."""
     from servoscope.cli.render import results
-    from servoscope.report.page import say
     from servoscope.simulation.tutorial import DAYS, tutorial_log
 
     out = results.create_console()

@@ -11,11 +11,11 @@ import typer
 from servoscope.cli.app import app
 from servoscope.cli.exit import print_json
 from servoscope.cli.service import check_web_extra
-from servoscope.core.messages import message, render, translate
-from servoscope.service.access import ROLES, Role, Users
+from servoscope.core.errors import ConfigError
+from servoscope.core.messages import say, translate
+from servoscope.service.access import ROLES, Role, Users, WebSettings
 
 if TYPE_CHECKING:
-    from servoscope.service.access import WebSettings
     from servoscope.service.config import ServiceFile
 
 users_app = typer.Typer(no_args_is_help=True, help="Who may log in to the pages: names, roles and passwords in a file.")
@@ -65,13 +65,12 @@ def serve(
     missing = "://" not in url and not (here / url).exists()
     opened = Store.open(url, here, write=missing, lock_timeout_s=STORE_TIMEOUT_S)
     if missing:
-        typer.echo(render(message("cli.new_store", name=opened.name)), err=True)
+        typer.echo(say("cli.new_store", name=opened.name), err=True)
     run_server(settings, opened, service, here, with_parent=with_parent)
 
 
 def _is_empty(config: Path) -> bool:
     """Tell whether a service file says nothing yet: then the pages lead to the first machine."""
-    from servoscope.core.errors import ConfigError
     from servoscope.core.settings import parse_toml, read_toml_text
 
     return not parse_toml(read_toml_text(config, "service file", ConfigError), config, ConfigError)
@@ -81,9 +80,7 @@ def merge_web_settings(config: ServiceFile | None, given: dict[str, object]) -> 
     """Return the section ``[web]`` with the options of the command line in place of its own."""
     from pydantic import ValidationError
 
-    from servoscope.core.errors import ConfigError
     from servoscope.core.settings_errors import describe_error
-    from servoscope.service.access import WebSettings
 
     base = config.web.model_dump() if config is not None and config.web is not None else {}
     try:
@@ -114,7 +111,7 @@ def add(
     else:
         password = typer.prompt(translate("Password"), hide_input=True, confirmation_prompt=True)
     known.add(name, chosen, password)
-    typer.echo(render(message("cli.user", file=str(file), name=name, role=chosen)))
+    typer.echo(say("cli.user", file=str(file), name=name, role=chosen))
 
 
 @users_app.command("list")
@@ -134,4 +131,4 @@ def print_users(
 def remove(name: NameArgument, file: UsersOption = DEFAULT_USERS_FILE) -> None:
     """Remove a user; its sessions end."""
     Users(file).remove(name)
-    typer.echo(render(message("cli.no_user", file=str(file), name=name)))
+    typer.echo(say("cli.no_user", file=str(file), name=name))

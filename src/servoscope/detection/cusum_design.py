@@ -75,7 +75,7 @@ def choose_cusum_hypotheses(
 
     `covariance`: of the logarithms of the plant's parameters, shape (m, m).
     """
-    whitened = _WhitenedResidual(_design_expectation(expectation), plant, noise)
+    whitened = _WhitenedResidual(expectation, plant, noise)
     if len(whitened.phi) < MIN_UPDATES:
         return ()
     size = np.sqrt((whitened.phi**2).mean(axis=0))
@@ -98,11 +98,7 @@ def worst_case_hypotheses(
     expectation: Expectation, plant: Plant, noise: WhiteNoise, covariance: FloatArray, chosen: Sequence[CusumHypothesis]
 ) -> tuple[CusumHypothesis, ...]:
     """Return the same changes with rate and drift under another reference where those are worse."""
-    return _WhitenedResidual(_design_expectation(expectation), plant, noise).worst_case(chosen, covariance)
-
-
-def _design_expectation(expectation: Expectation) -> Expectation:
-    return expectation.truncate(design_duration_s(expectation.pipeline))
+    return _WhitenedResidual(expectation, plant, noise).worst_case(chosen, covariance)
 
 
 def design_duration_s(pipeline: Pipeline) -> float:
@@ -115,11 +111,11 @@ class _WhitenedResidual:
 
     def __init__(self, expectation: Expectation, plant: Plant, noise: WhiteNoise) -> None:
         pipeline = expectation.pipeline
-        self.expectation, self.plant = expectation, plant
+        self.expectation, self.plant = expectation.truncate(design_duration_s(pipeline)), plant
         self.rate, self.together = pipeline.loop.sample_rate / pipeline.stride, pipeline.cusum_updates
         self.noise_model = residual_noise_model(pipeline, plant, noise)
         self.theta, self.warm_up = nominal_theta(pipeline.loop, plant), whitening_filter(self.noise_model)[3]
-        g = expectation.regression(plant)
+        g = self.expectation.regression(plant)
         self.phi = lagged_columns(self.noise_model.whiten(g.phi[g.ok]))[self.warm_up :]
         self.healthy = self.noise_model.whiten((g.eta - g.phi @ self.theta)[g.ok])
 

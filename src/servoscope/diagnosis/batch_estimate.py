@@ -13,9 +13,9 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError, RecordingError
 from servoscope.detection.onset import Onset
 from servoscope.diagnosis.pressure_evidence import pressure_inputs
-from servoscope.estimation.instrumental_fit import InstrumentalFit, fit_with_instrument
-from servoscope.estimation.tuning import fit_tuning
 from servoscope.evidence.examination import Examination
+from servoscope.fit.instrumental_fit import InstrumentalFit, fit_with_instrument
+from servoscope.fit.tuning import fit_tuning
 from servoscope.isolation.signature import Signature
 from servoscope.isolation.signatures import fault_signatures
 

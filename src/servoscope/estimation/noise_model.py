@@ -19,11 +19,9 @@ from servoscope.models.lti import LinearSystem, autocovariances, decimate_noise,
 
 AR_ORDER = 10
 MIN_VARIANCE_SHARE = 1e-9  # of the variance of v: no innovation is smaller
-RESPONSE_TAIL = 1e-4  # of a closed loop's answer that an autocovariance may leave out
 CANCELLATION_SHARE = 0.05  # of a pole's distance from the unit circle, within which a zero cancels it
 WHITENESS_LAGS = 20  # of innovations that should be white
 RESPONSE_SAMPLES = 2000  # samples of a whitening filter's answer that are looked at
-LIKELIHOOD_DROP = 1.5  # by which the log-likelihood may fall at the upper bound of a noise
 
 
 @dataclass(frozen=True)
@@ -209,87 +207,3 @@ def colour_error(model: ArmaNoise, system: LinearSystem, stride: int) -> float:
     both = np.arange(1 - RESPONSE_SAMPLES, RESPONSE_SAMPLES)
     left = np.array([float(pairs @ gamma[np.abs(lag + both)]) for lag in range(WHITENESS_LAGS + 1)]) / model.variance
     return max(abs(float(left[0]) - 1.0), float(np.abs(left[1:]).max()))
-
-
-def _spectra(system: LinearSystem, stride: int, samples: int) -> FloatArray:
-    """Return the power spectra of v under unit noise on each input, at rfft's frequencies of a run, shape (M, m)."""
-    slowest = float(np.abs(np.linalg.eigvals(system.A)).max(initial=0.0)) ** stride
-    memory = np.log(RESPONSE_TAIL) / np.log(slowest) if 0.0 < slowest < 1.0 else 1.0
-    lags = int(min(max(64, memory), max(samples // 2, 1)))
-    columns = []
-    for unit in np.eye(system.B.shape[1]):
-        gamma = autocovariances(system.input(unit[:, None]), lags, stride)[:, 0, 0]
-        whole = np.zeros(samples)
-        whole[: lags + 1] += gamma
-        whole[samples - lags :] += gamma[:0:-1]
-        columns.append(np.maximum(np.fft.rfft(whole).real, 0.0))
-    return np.stack(columns, axis=1)
-
-
-def _periodogram(v: FloatArray) -> FloatArray:
-    """Return |V(f)|^2 of a run under a Hann window, against leakage from strong frequencies."""
-    window = np.hanning(len(v))
-    return np.asarray(np.abs(np.fft.rfft(v * window)) ** 2 / (window**2).sum())
-
-
-@dataclass(frozen=True)
-class WhiteNoiseFit:
-    """White noises of u and y fitted to residuals."""
-
-    noise: WhiteNoise
-    # upper bounds of each: Whittle's likelihood falls by the factor exp(-`LIKELIHOOD_DROP`) there
-    loudest: WhiteNoise
-    cost: float  # minus the logarithm of the likelihood
-
-
-def fit_white_noise(system: LinearSystem, runs: Sequence[FloatArray], stride: int) -> WhiteNoiseFit:
-    """Fit n_u and n_y to residuals v, one array per recording, by Whittle's likelihood (1953).
-
-    `system` leads from noise on u and on y to v, for example `residual_system`.
-    """
-    from scipy.optimize import minimize
-
-    I = np.concatenate([_periodogram(v)[1:-1] for v in runs])
-    S = np.concatenate([_spectra(system, stride, len(v))[1:-1] for v in runs])
-    size, level = S.mean(axis=0), float(I.mean())
-    S = S / size + MIN_VARIANCE_SHARE
-    I = I / level
-
-    def cost(x: FloatArray) -> tuple[float, FloatArray]:
-        parts = S * np.exp(x)
-        model = parts.sum(axis=1)
-        return float((np.log(model) + I / model).sum()), ((1.0 / model - I / model**2) @ parts)
-
-    optimize_result = minimize(cost, np.full(2, np.log(0.5)), jac=True, method="L-BFGS-B", bounds=[(-25.0, 3.0)] * 2)
-    best = float(optimize_result.fun)
-
-    def std(x: FloatArray) -> FloatArray:
-        return np.asarray(np.sqrt(np.exp(x) * level / size))
-
-    most = np.array(optimize_result.x)
-    for i in (0, 1):
-        low, high = float(optimize_result.x[i]), 5.0
-        for _ in range(30):
-            middle = 0.5 * (low + high)
-            raised = np.where(np.arange(2) == i, middle, optimize_result.x)
-            low, high = (middle, high) if cost(raised)[0] < best + LIKELIHOOD_DROP else (low, middle)
-        most[i] = high
-    likely, loudest = std(optimize_result.x), std(most)
-    return WhiteNoiseFit(
-        WhiteNoise(float(likely[0]), float(likely[1])),
-        WhiteNoise(float(loudest[0]), float(loudest[1])),
-        best + len(I) * float(np.log(level)),
-    )
-
-
-def whittle_cost(model: ArmaNoise, runs: Sequence[FloatArray]) -> float:
-    """Return minus the logarithm of Whittle's likelihood of a model."""
-    from scipy.signal import freqz
-
-    total = 0.0
-    A, B = model.polynomials
-    for v in runs:
-        w = 2.0 * np.pi * np.arange(len(v) // 2 + 1)[1:-1] / len(v)
-        S = model.variance * np.abs(freqz(B, A, w)[1]) ** 2
-        total += float((np.log(S) + _periodogram(v)[1:-1] / S).sum())
-    return total

@@ -325,6 +325,7 @@ def _kernel_spec(constants: Sequence[RecursionConstants]) -> KernelSpec:
     sizes = KernelSizes(
         n=n,
         rows=rows,
+        inputs=first.bank.B.shape[1],
         states=len(first.bank.A),
         speed=speed,
         gated=first.only_moving,

@@ -13,9 +13,9 @@ from servoscope.core.errors import NotEnoughError
 from servoscope.core.messages import message
 from servoscope.detection.statistic import t2_statistic
 from servoscope.estimation.pipeline import Pipeline, Regression
-from servoscope.estimation.tuning import TuningFit, coloured_covariance, fit_tuning, least_squares
 from servoscope.evidence.examination import Examination
 from servoscope.evidence.kind import EvidenceKind, Finding
+from servoscope.fit.tuning import TuningFit, coloured_covariance, fit_tuning, least_squares
 from servoscope.signals import Recording
 
 STRETCH = 2.0  # memories over which coefficients count as constant

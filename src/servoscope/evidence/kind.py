@@ -12,9 +12,9 @@ from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.covariates import CovariateModel
 from servoscope.core.messages import Message
 from servoscope.estimation.pipeline import Pipeline, Regression
-from servoscope.estimation.tuning import TuningFit
 from servoscope.evidence.examination import Examination
 from servoscope.evidence.population import Population
+from servoscope.fit.tuning import TuningFit
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 

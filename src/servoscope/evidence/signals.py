@@ -19,7 +19,8 @@ from servoscope.signals.quality import QualityFinding, QualitySettings, check_bl
 
 SIGNALS = ("r", "u", "y")
 # units that are confused: powers of ten; inches and mm; degrees and radians; turns and radians; per minute and second
-FACTORS = (*(10.0**k for k in range(1, 7)), 25.4, 180.0 / np.pi, 2.0 * np.pi, 60.0)
+_RATIOS = (*(10.0**k for k in range(1, 7)), 25.4, 180.0 / np.pi, 2.0 * np.pi, 60.0)
+FACTORS = (*_RATIOS, *(1.0 / ratio for ratio in _RATIOS))
 MIN_RESIDUAL_RATIO = 5.0  # times smaller is the residual of the healthy plant where the signals are put right
 # the same where that residual is the healthy one, and up to how many times that it counts as such
 HEALTHY_RESIDUAL_RATIO = 2.0
@@ -142,7 +143,7 @@ def find_corrections(
     near = [correction for correction, (power, _) in tried.items() if power < 2.5 * best]
     if residual_power:
         near.sort(key=lambda similar: abs(np.log(max(tried[similar][1], 1e-300) / residual_power)))
-    spreads = _spread(rows.r), _spread(rows.y)
+    spreads = float(np.std(rows.r)), float(np.std(rows.y))
     opposed = min(spreads) > 0.0 and float(np.corrcoef(rows.r, rows.y)[0, 1]) < 0.0
     for correction in near:
         factor = correction.factors[2]
@@ -195,17 +196,17 @@ def _single_corrections() -> Iterator[Correction]:
     for order in ((2, 1, 0), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1)):
         yield Correction(order=order)
     yield Correction(factors=(1.0, 1.0, -1.0))
-    for factor in (*FACTORS, *(1.0 / inverse for inverse in FACTORS)):
+    for factor in FACTORS:
         yield Correction(factors=(1.0, 1.0, factor))
         yield Correction(factors=(1.0, factor, 1.0))
 
 
 def _reference_corrections(rows: Recording) -> Iterator[Correction]:
     """Yield r in another unit, which the plant does not notice, where r is much larger or smaller than y."""
-    spreads = _spread(rows.r), _spread(rows.y)
+    spreads = float(np.std(rows.r)), float(np.std(rows.y))
     if min(spreads) > 0.0:
         ratio = spreads[1] / spreads[0]
-        for factor in (*FACTORS, *(1.0 / inverse for inverse in FACTORS)):
+        for factor in FACTORS:
             if abs(ratio / factor - 1.0) < UNIT_ERROR:
                 yield Correction(factors=(factor, 1.0, 1.0))
 
@@ -224,10 +225,6 @@ def _residual_share(
     left = float(np.mean((g.eta[used] - g.phi[used] @ theta) ** 2))
     whole = float(np.mean(g.eta[used] ** 2))
     return (left / whole if whole > 0.0 else np.inf), left
-
-
-def _spread(x: FloatArray) -> float:
-    return float(np.std(x))
 
 
 def _frozen_samples(recording: Recording) -> int:

@@ -13,10 +13,11 @@ from servoscope.core.errors import NotEnoughError
 from servoscope.core.messages import message
 from servoscope.detection.warm_up import BLOCK_MEMORIES, NAME, BlockSums, WarmUpFit, fit_course
 from servoscope.estimation.pipeline import Pipeline, Regression
-from servoscope.estimation.tuning import TuningFit
 from servoscope.evidence.covariates import MIN_PROPORTIONAL_STDS, STRETCH, refer_to_covariates
 from servoscope.evidence.examination import Examination
 from servoscope.evidence.kind import EvidenceKind, Finding
+from servoscope.fit.search import minimise_from_grid
+from servoscope.fit.tuning import TuningFit
 from servoscope.models.lti import solve_scaled
 from servoscope.signals import Recording
 
@@ -108,7 +109,6 @@ def _with_time_constant(
     blank: WarmUp, sums: Sequence[BlockSums], theta: FloatArray, model: CovariateModel, duration_s: float
 ) -> WarmUp:
     """Return the warm-up with the time constant that leaves least of the recordings unexplained."""
-    from scipy.optimize import minimize_scalar
 
     def made(log_s: float) -> WarmUp:
         return blank.model_copy(update={"time_constant_s": float(np.exp(log_s))})
@@ -117,9 +117,7 @@ def _with_time_constant(
         return sum(fit_course(block_sums, made(log_s), theta, model).cost for block_sums in sums)
 
     tried = np.linspace(np.log(sums[0].seconds), np.log(MAX_DURATIONS * duration_s), TIME_CONSTANT_GRID_SIZE)
-    best = int(np.argmin([cost(constant) for constant in tried]))
-    bounds = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
-    return made(float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 0.01}).x))
+    return made(minimise_from_grid(cost, tried, 0.01))
 
 
 def _variance(sums: Sequence[BlockSums], courses: Sequence[WarmUpFit]) -> float:

@@ -19,8 +19,9 @@ from servoscope.estimation.kernel.sample_steps import ARMED, SAMPLE
 from servoscope.estimation.kernel.spec import KernelSpec
 from servoscope.estimation.recursion import Recursion
 from servoscope.export.image import fingerprint
+from servoscope.export.texts import plain_text
 
-__all__ = ["ExportConstants", "check_name", "common_words", "plain_text", "refuse_covariates"]
+__all__ = ["ExportConstants", "check_name", "common_words", "covariate_tables", "refuse_covariates"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,29 +118,53 @@ class ExportConstants:
             input_stage=stage,
         )
 
-    @property
-    def coefficients(self) -> list[tuple[str, str]]:
-        """Name and unit of each coefficient."""
-        return list(zip(self.baseline.names, self.baseline.loop.plant.coefficient_units, strict=True))
-
 
 def common_words(made: ExportConstants, name: str) -> dict[str, Any]:
     """Return what the templates of all languages name."""
-    baseline, c = made.baseline, made.recursion.constants[0]
-    of_y, of_u = baseline.loop.plant.units[0] or "y", baseline.loop.plant.units[1] or "u"
+    baseline, c, plant = made.baseline, made.recursion.constants[0], made.baseline.loop.plant
+    of_y, of_u = plant.units[0] or "y", plant.units[1] or "u"
+    coefficients = "; ".join(
+        f"{coefficient} [{unit}]" for coefficient, unit in zip(baseline.names, plant.coefficient_units, strict=True)
+    )
     return {
+        "made": made,
+        "size": made.spec.sizes,
         "version": __version__,
         "hash": baseline.hash,
         "loop": plain_text(baseline.loop.name),
         "prefix": name,
         "upper": name.upper(),
+        "units": plain_text(coefficients),
         "u_unit": plain_text(f"{of_u}, behind the stage {made.input_stage}" if made.input_stage else of_u),
         "y_unit": plain_text(of_y),
         "response_unit": plain_text(f"{of_u}/{of_y}"),
         "stride": c.stride,
         "every": c.every,
+        "on_delay": made.delays[0],
+        "off_delay": made.delays[1],
+        "mark": [f"0x{byte:02X}u" for byte in made.mark],
         "sample": SAMPLE,
         "armed": ARMED,
+    }
+
+
+def covariate_tables(made: ExportConstants) -> dict[str, FloatArray]:
+    """Return the constants that a monitor with covariates has beside those of its recursion, by name."""
+    if made.covariates is None:
+        return {}
+    model, c = made.covariates.model, made.recursion.constants[0]
+    half = 0.5 * (np.array(model.high) - np.array(model.low))
+    E = made.baseline.pipeline().bank.E(made.baseline.loop.monitor.frequencies)
+    return {
+        "known_range": np.column_stack(model.known),
+        "learned": np.column_stack([model.origin, half]),
+        "slopes": np.array(model.slopes),
+        "slope_covariance": np.array(model.covariance),
+        "to_state": np.linalg.inv(c.basis),
+        "to_response": np.stack([E.real, E.imag], axis=1).reshape(-1, len(made.expected)),
+        "theta_middle": np.array(made.baseline.theta),
+        "theta_expected": made.expected,
+        "theta_origin": c.origin,
     }
 
 
@@ -168,8 +193,3 @@ def check_name(name: str) -> None:
         raise BaselineError(
             f"{name!r} is no prefix for names of C: give lower-case letters, digits and _, as in axis_3"
         )
-
-
-def plain_text(text: str) -> str:
-    """Return a text that cannot end a comment, of C or of Structured Text."""
-    return re.sub(r"\*/|\*\)|\(\*|[\\\"\n]", " ", text).replace("/*", " ")

@@ -11,14 +11,14 @@ import tempfile
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from xml.etree import ElementTree as Xml
 
 from servoscope import __version__
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import OutputError
 from servoscope.core.files import atomic_write
-from servoscope.export.c_monitor import NAME, CMonitor, export_c, fill_template
+from servoscope.export.c_monitor import NAME, RESPONSE, export_c
 from servoscope.export.constants import refuse_covariates
+from servoscope.export.texts import fill_template
 
 __all__ = ["export_fmu"]
 
@@ -27,8 +27,6 @@ LIBRARY = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": (
 PROCESSORS = {"amd64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}
 EPOCH = (1980, 1, 1, 0, 0, 0)  # of all files in the archive: the same baseline gives the same bytes
 FIRST_NUMBER = 10  # value reference of the first number of an evaluation; fmi3.c calls it NUMBERS
-RESPONSE = ("real", "imag", "variance_real", "covariance", "covariance_again", "variance_imag")
-VERDICTS = ("waiting", "healthy", "fault")
 
 
 def export_fmu(baseline: Baseline, path: str | Path, name: str = NAME, *, only_coefficients: bool = False) -> bool:
@@ -59,11 +57,26 @@ def export_fmu(baseline: Baseline, path: str | Path, name: str = NAME, *, only_c
     """
     refuse_covariates(baseline, "co-simulation unit")
     made = export_c(baseline, name, only_coefficients=only_coefficients)
-    source = fill_template("fmi3.c", {"prefix": name, "upper": name.upper(), "token": _token(made)})
+    loop, outputs = baseline.loop, list(_outputs(baseline))
+    y_unit, u_unit = (unit or "1" for unit in loop.plant.units)
+    values = {
+        "prefix": name,
+        "upper": name.upper(),
+        "version": __version__,
+        "token": f"{{servoscope-{__version__}-{made.mark.hex()}}}",
+        "servo": loop,
+        "y_unit": y_unit,
+        "u_unit": u_unit,
+        "units": sorted({"s", y_unit, u_unit, *(unit for _, unit, _ in outputs if unit)}),
+        "limit": baseline.thresholds.statistic,
+        "outputs": outputs,
+        "numbers": list(range(FIRST_NUMBER, FIRST_NUMBER + len(outputs))),
+    }
+    source = fill_template("fmi3.c", **values)
     sources = {file: made.files[file] for file in (f"{name}.c", f"{name}.h")} | {"fmi3.c": source}
     contents = {f"sources/{file}": text.encode() for file, text in sources.items()}
-    contents["modelDescription.xml"] = _xml(_model_description(baseline, made, name))
-    contents["sources/buildDescription.xml"] = _xml(_build_description(name))
+    contents["modelDescription.xml"] = fill_template("modelDescription.xml", **values).encode()
+    contents["sources/buildDescription.xml"] = fill_template("buildDescription.xml", **values).encode()
     binary = _compile(sources, name)
     if binary is not None:
         contents[_binary_path(name)] = binary
@@ -73,11 +86,6 @@ def export_fmu(baseline: Baseline, path: str | Path, name: str = NAME, *, only_c
             unit.writestr(zipfile.ZipInfo(file, EPOCH), content, zipfile.ZIP_DEFLATED)
     atomic_write(path, archive.getvalue())
     return binary is not None
-
-
-def _token(made: CMonitor) -> str:
-    """Return what ties description and binary together: the mark of the baseline and the version of the interface."""
-    return f"{{servoscope-{__version__}-{made.mark.hex()}}}"
 
 
 def _binary_path(name: str) -> str:
@@ -100,100 +108,6 @@ def _compile(sources: dict[str, str], name: str) -> bytes | None:
             last = (done.stderr.strip().splitlines() or ["no message"])[-1]
             raise OutputError(f"{compiler} cannot compile the co-simulation unit: {last}; give another compiler as cc")
         return Path(scratch, "unit").read_bytes()
-
-
-def _xml(root: Xml.Element) -> bytes:
-    Xml.indent(root)
-    text = Xml.tostring(root, encoding="unicode")
-    return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'.encode()
-
-
-def _build_description(name: str) -> Xml.Element:
-    root = Xml.Element("fmiBuildDescription", fmiVersion="3.0")
-    configuration = Xml.SubElement(root, "BuildConfiguration", modelIdentifier=name)
-    files = Xml.SubElement(configuration, "SourceFileSet", language="C99", compilerOptions="-ffp-contract=off")
-    for source in ("fmi3.c", f"{name}.c"):
-        Xml.SubElement(files, "SourceFile", name=source)
-    Xml.SubElement(configuration, "Library", name="m", external="true")
-    return root
-
-
-def _model_description(baseline: Baseline, made: CMonitor, name: str) -> Xml.Element:
-    outputs = list(_outputs(baseline))
-    y_unit, u_unit = (unit or "1" for unit in (baseline.loop.plant.units[0], baseline.loop.plant.units[1]))
-    root = Xml.Element(
-        "fmiModelDescription",
-        fmiVersion="3.0",
-        modelName=baseline.loop.name,
-        instantiationToken=_token(made),
-        description="Condition monitoring of a servo loop from reference, control input and measured output",
-        generationTool=f"servoscope {__version__}",
-        variableNamingConvention="structured",
-    )
-    sample_time = repr(1.0 / baseline.loop.sample_rate)
-    Xml.SubElement(
-        root,
-        "CoSimulation",
-        modelIdentifier=name,
-        canGetAndSetFMUState="true",
-        canSerializeFMUState="true",
-        fixedInternalStepSize=sample_time,
-    )
-    units = Xml.SubElement(root, "UnitDefinitions")
-    for unit in sorted({"s", y_unit, u_unit, *(unit for _, unit, _ in outputs if unit)}):
-        Xml.SubElement(units, "Unit", name=unit)
-    types = Xml.SubElement(Xml.SubElement(root, "TypeDefinitions"), "EnumerationType", name="Verdict")
-    for value, verdict in enumerate(VERDICTS):
-        Xml.SubElement(types, "Item", name=verdict, value=str(value))
-    Xml.SubElement(root, "DefaultExperiment", startTime="0", stepSize=sample_time)
-    variables = Xml.SubElement(root, "ModelVariables")
-    _describe_variables(variables, (y_unit, u_unit), baseline.thresholds.statistic, outputs)
-    structure = Xml.SubElement(root, "ModelStructure")
-    for kind, attribute, known in (("Output", "causality", "output"), ("InitialUnknown", "initial", "calculated")):
-        for variable in variables:
-            if variable.get(attribute) == known:
-                Xml.SubElement(structure, kind, valueReference=variable.get("valueReference", ""))
-    return root
-
-
-def _describe_variables(
-    variables: Xml.Element, units: tuple[str, str], limit: float, outputs: list[tuple[str, str, str]]
-) -> None:
-    """Write the variables; fmi3.c has the same value references."""
-
-    def variable(kind: str, reference: int, **attributes: str) -> None:
-        Xml.SubElement(variables, kind, {"valueReference": str(reference), **attributes})
-
-    variable("Float64", 0, name="time", causality="independent", variability="continuous", unit="s")
-    signals = (("r", units[0], "reference"), ("u", units[1], "control input"), ("y", units[0], "measured output"))
-    for reference, (signal, unit, text) in enumerate(signals, 1):
-        variable(
-            "Float64",
-            reference,
-            name=signal,
-            causality="input",
-            variability="discrete",
-            start="0",
-            unit=unit,
-            description=f"{text}; NaN is a missing sample",
-        )
-    variable(
-        "Boolean",
-        4,
-        name="restart",
-        causality="input",
-        variability="discrete",
-        start="false",
-        description="the sample does not follow the one before by one sample time",
-    )
-    made = {"causality": "output", "variability": "discrete", "initial": "calculated"}
-    variable("Enumeration", 5, name="verdict", declaredType="Verdict", **made)
-    variable("UInt64", 6, name="evaluations", description="evaluations so far; 0: nothing else is known yet", **made)
-    limited = {"causality": "output", "variability": "constant", "initial": "exact", "start": repr(limit)}
-    variable("Float64", 7, name="limit", description="of the statistic T^2", **limited)
-    for reference, (name, unit, text) in enumerate(outputs, FIRST_NUMBER):
-        extra = ({"unit": unit} if unit else {}) | ({"description": text} if text else {})
-        variable("Float64", reference, name=name, **made, **extra)
 
 
 def _outputs(baseline: Baseline) -> Iterator[tuple[str, str, str]]:

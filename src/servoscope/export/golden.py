@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -12,16 +13,17 @@ import numpy.typing as npt
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.covariates import CovariateModel
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
-from servoscope.core.jit.c_source import c_literal
+from servoscope.core.errors import BaselineError
 from servoscope.detection.covariate_monitor import CovariateMonitor
 from servoscope.detection.statistic import apply_alarm_delays, consecutive_exceedances, t2_statistic
 from servoscope.export.constants import ExportConstants
 from servoscope.signals.quality import QualityLimits, QualitySettings, check_block, init_state
 
-__all__ = ["GoldenRun", "golden_covariates", "golden_signals", "golden_text"]
+__all__ = ["GoldenRun", "describe_rounding", "golden_covariates", "golden_signals", "golden_words"]
 
 MIN_GOLDEN_SAMPLES, MAX_GOLDEN_SAMPLES = 2000, 20_000  # samples
 SEED = 27
+MAX_FACTOR = 1.1  # in the rate of false alarms, of single precision
 TOLERANCE = 1e-9  # of T^2 beside covariates, relative above 1
 FROZEN = {"frozen_y": 1, "frozen_u": 2}
 WAITING, HEALTHY, FAULT = range(3)
@@ -169,44 +171,41 @@ def digest(numbers: Iterable[int]) -> int:
     return value
 
 
-def golden_text(run: GoldenRun, prefix: str, image: bytes) -> str:
-    """Return the header with the golden samples and results."""
+def golden_words(run: GoldenRun) -> dict[str, Any]:
+    """Return what the header with the golden samples and results names beside the image of the state."""
     samples_of = np.ascontiguousarray(np.stack(run.signals, axis=1))
-    bits = samples_of.view(np.dtype(f"u{samples_of.itemsize}"))
-    digests = [digest(row.astype(row.dtype.newbyteorder("<")).tobytes()) for row in run.rows]
-    lines = _covariate_lines(run)
-    samples = ",\n".join("{" + ", ".join(f"0x{x:0{2 * bits.itemsize}X}u" for x in row) + "}" for row in bits.tolist())
-    return "\n".join(
-        [
-            f"/* Golden samples of {prefix}.c as the bits of numbers, and the digests (FNV-1a) of its evaluations. */",
-            f"#define GOLDEN_SAMPLES {len(bits)}",
-            f"#define GOLDEN_EVALUATIONS {len(digests)}",
-            f"static const uint{8 * bits.itemsize}_t golden_samples[GOLDEN_SAMPLES][3] = {{\n{samples}}};",
-            f"static const unsigned char golden_restart[GOLDEN_SAMPLES] = {{{_list(map(int, run.restart.tolist()))}}};",
-            f"static const uint64_t golden_evaluations[] = {{{_list(f'0x{x:016X}u' for x in digests)}}};",
-            f"static const unsigned char golden_verdicts[] = {{{_list(run.verdicts)}}};",
-            f"#define GOLDEN_HELD {run.held}u",
-            f"#define GOLDEN_STRETCH {run.stretch}u",
-            f"#define GOLDEN_FROZEN 0x{digest(run.frozen.tolist()):016X}u",
-            f"static const unsigned char golden_image[] = {{{_list(image)}}};",
-            *lines,
-            "",
-        ]
+    rows = samples_of.view(np.dtype(f"u{samples_of.itemsize}")).tolist()
+    digits = 2 * samples_of.itemsize
+    return {
+        "run": run,
+        "tolerance": TOLERANCE,
+        "samples": ["{" + ", ".join(f"0x{bits:0{digits}X}u" for bits in row) + "}" for row in rows],
+        "digests": [f"0x{digest(row.astype(row.dtype.newbyteorder('<')).tobytes()):016X}u" for row in run.rows],
+        "frozen": f"0x{digest(run.frozen.tolist()):016X}u",
+    }
+
+
+def describe_rounding(made: ExportConstants, only_coefficients: bool, golden: GoldenRun) -> str:
+    """Return what single precision does to the golden samples; raise BaselineError where that eats the promise.
+
+    T^2 and the sequential test are log-likelihoods: an error of d multiplies the rate of false alarms by exp(d/2), or
+    by exp(d h) where d is in units of a CUSUM's limit h.
+    """
+    double = ExportConstants.from_baseline(made.baseline, only_coefficients)
+    exact = GoldenRun.from_baseline(double)
+    limit = made.baseline.thresholds.statistic
+    near = exact.rows[:, 1] < 2.0 * limit  # far above it, nothing hangs on an error
+    watch = double.recursion.constants[0].watch
+    h = 0.0 if watch is None else float(watch.limits.max())
+    errors = np.abs(golden.rows.astype(np.float64) - exact.rows)[near][:, 1:3].max(axis=0, initial=0.0)
+    factor = math.exp(max(0.5 * errors[0], h * errors[1]))
+    if not factor <= MAX_FACTOR:
+        raise BaselineError(
+            f"{made.baseline.loop.name}: in single precision T^2 is off by up to {errors[0]:.2g} on golden samples, "
+            f"and the rate of false alarms by a factor of {factor:.2g}: export double precision"
+        )
+    return (
+        f"\n * Numbers are of single precision. On the golden samples that moves T^2 by no more than {errors[0]:.2g}"
+        f" near its limit\n * {limit:.4g}, and the level of the sequential test by no more than"
+        f" {errors[1]:.2g}: a factor of {factor:.4g} in the rate of false alarms.\n *"
     )
-
-
-def _covariate_lines(run: GoldenRun) -> list[str]:
-    """Return what a self-test compares within a tolerance, since exp and sums are rounded elsewhere by other rules."""
-    if run.covariates is None:
-        return []
-    values = ",\n".join("{" + ", ".join(map(c_literal, row)) + "}" for row in run.covariates.tolist())
-    return [
-        f"#define GOLDEN_TOLERANCE {TOLERANCE} /* of a statistic, relative above 1 */",
-        f"static const double golden_covariates[GOLDEN_SAMPLES][{run.covariates.shape[1]}] = {{\n{values}}};",
-        f"static const double golden_statistics[] = {{{_list(map(c_literal, run.rows[:, 1].tolist()))}}};",
-    ]
-
-
-def _list(items: object) -> str:
-    texts = [str(item) for item in items]  # type: ignore[attr-defined]
-    return ",\n".join(", ".join(texts[i : i + 24]) for i in range(0, len(texts), 24))

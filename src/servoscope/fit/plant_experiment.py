@@ -16,9 +16,9 @@ import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.estimation.noise_model import WhiteNoise
-from servoscope.estimation.tuning import sandwich_covariance, sum_covariance
 from servoscope.fit.predictor import MAX_GAIN_SAMPLES, Predictor, PredictorFactory
 from servoscope.fit.search import Experiment, Fit
+from servoscope.fit.tuning import sandwich_covariance, sum_covariance
 from servoscope.models.discretise import split_delay
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Column, Plant

@@ -24,6 +24,7 @@ FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-9, 1e6
 DAMPING_FACTOR = 10.0
 CANNOT_RUN = (ValueError, np.linalg.LinAlgError, SimulationError)
 MIN_INFORMATION = 1e-300
+LIKELIHOOD_DROP = 1.5  # by which the log-likelihood may fall at the upper bound of an unknown
 MAX_REFINEMENTS = 500  # steps between two points of a grid
 
 
@@ -150,6 +151,19 @@ def fit(
         if before - at.cost < tolerance:
             break
     return at
+
+
+def raise_unknown(fitted: Fit, i: int, highest: float, bisections: int) -> Fit:
+    """Return a fit with an unknown as large as its likelihood allows, the others as they are."""
+    largest, x = fitted, fitted.x.copy()
+    for _ in range(bisections):
+        x[i] = 0.5 * (largest.x[i] + highest)
+        middle = fitted.experiment.at(x.copy(), fitted.free)
+        if middle.cost < fitted.cost + 2.0 * LIKELIHOOD_DROP:
+            largest = middle
+        else:
+            highest = float(x[i])
+    return largest
 
 
 def minimise_from_grid(

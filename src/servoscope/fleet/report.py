@@ -7,11 +7,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from servoscope.core.files import atomic_write, make_folder
-from servoscope.core.messages import Message, count_words, message, translate
+from servoscope.core.messages import Message, count_words, message, say, translate
 from servoscope.fleet.rows import MICRO
 from servoscope.fleet.summary import COMMON, FAILED, RATE, Fleet
 from servoscope.report.format_values import DASH, format_clock_time, format_count, format_size
-from servoscope.report.page import render_page, say, write_page
+from servoscope.report.page import render_page, write_page
 
 MAX_TABLE_ROWS = 300  # of a table: a page is read by people
 MAX_NAMES, MAX_CAUSES = 20, 3  # in a sentence

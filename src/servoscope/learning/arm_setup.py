@@ -17,6 +17,7 @@ from servoscope.core.errors import LoopError, NotEnoughError, RecordingError
 from servoscope.core.messages import Message, message
 from servoscope.core.settings import read_toml_text
 from servoscope.estimation.arm_regression import ArmSignals, block_information, filter_arm_log
+from servoscope.fit.search import Experiment, fit
 from servoscope.models.arm.model import ArmModel
 from servoscope.models.arm.settings import DEFAULT_CUTOFF, ArmLoop
 from servoscope.models.arm.urdf import Kinematics, parse_urdf
@@ -170,8 +171,6 @@ def calibrate_load(baseline: ArmBaseline, recording: ArmRecording, mass: float) 
     torque of the load, c_j the ratio of its true gain to that of the loop file; the c_j and the load's centre of mass
     are found together. Raises LoopError for coupled joints, NotEnoughError if the arm hardly moves.
     """
-    from scipy.optimize import least_squares
-
     model = baseline.model
     if len(model.coupled):
         raise LoopError(
@@ -197,13 +196,12 @@ def calibrate_load(baseline: ArmBaseline, recording: ArmRecording, mass: float) 
     target = root @ np.linalg.pinv(known, hermitian=True) @ (g[-first:] - gain.T @ g[:-first])
 
     def misfit(x: FloatArray) -> FloatArray:
-        load = np.concatenate([[mass], x[n:]])
-        return np.concatenate([root @ np.outer(x[:n], load).ravel() - target, (x[:n] - 1.0) / GAIN_SPREAD])
+        return np.asarray(root @ np.outer(1.0 + x[:n], np.concatenate([[mass], x[n:]])).ravel() - target)
 
-    fit = least_squares(misfit, np.concatenate([np.ones(n), np.zeros(len(PAYLOAD) - 1)]))
-    jacobian = np.asarray(fit.jac)
-    std = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+    unknowns = n + len(PAYLOAD) - 1  # a joint's ratio of gains less 1, and the load's centre of mass times its mass
+    fitted = fit(Experiment(misfit, np.where(np.arange(unknowns) < n, GAIN_SPREAD, np.inf)), np.zeros(unknowns))
+    ratio, std = 1.0 + fitted.x, np.sqrt(np.diag(fitted.covariance))
     return [
-        JointGain(joint, baseline.loop.joints[joint].gain / float(fit.x[j]), float(std[j] / abs(fit.x[j])))
+        JointGain(joint, baseline.loop.joints[joint].gain / float(ratio[j]), float(std[j] / abs(ratio[j])))
         for j, joint in enumerate(model.arm.names)
     ]

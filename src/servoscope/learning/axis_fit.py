@@ -13,10 +13,12 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError
 from servoscope.core.messages import Message, message
 from servoscope.estimation.axis_filter import NO_LAG, AxisFilter, AxisNoise, AxisSignals, DriveLag, axis_stride
-from servoscope.estimation.tuning import sum_covariance
+from servoscope.fit.search import Experiment, fit
+from servoscope.fit.tuning import sandwich_covariance, sum_covariance
 from servoscope.isolation.ml.axis_scan import HEALTHY_MARGIN, largest_changes, scan_limit
 from servoscope.isolation.ml.axis_vibration import BANDS
 from servoscope.isolation.ml.axis_window import LONG_RUN_S, axis_signals
+from servoscope.isolation.ml.least_squares import normalise_columns
 from servoscope.models.loop import Loop
 from servoscope.models.plants.axis import AxisPlant
 from servoscope.signals import Recording
@@ -36,6 +38,7 @@ DELAYS_S, LAGS_S = np.arange(0.0, 0.1, 0.01), (0.0, 0.01, 0.02, 0.04, 0.08)  # t
 MIN_DRIVE_GAIN = 50.0  # of twice the log-likelihood, for a delay and a lag
 MIN_DRIVE_S = 5e-3  # of both together: less is what the sampling or a compliant coupling does
 MAX_DRIVE_ROUNDS = 3  # of delay and lag, and noise, in turns
+DRIVE_DIFFERENCE = 0.02  # samples of delay and lag, for derivatives: a lag below half of it is none
 STEPS, FIRST_STEP = 250, 0.7  # of the search for the noise: steps, and the logarithm of the first ones
 
 
@@ -45,8 +48,6 @@ class AxisFit:
 
     coefficients: FloatArray  # b, a and the nuisances, of ``y'' = b u - sum a_i column_i``
     covariance: FloatArray  # of their estimates, by the long-run variance of the scores
-    cost: float  # sum of squared innovations
-    count: int  # innovations that count
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,8 +171,6 @@ def fit_drive(
     Each recording has coefficients of its own. All columns but that of u stay, so that their directions are taken off
     once; a grid comes before the search, for the sum of squares has several minima.
     """
-    from scipy.optimize import minimize
-
     rate, stride = loop.sample_rate, round(loop.sample_rate / problems[0].signals.sample_rate)
     fixed = []
     for recording, problem in zip(recordings, problems, strict=True):
@@ -180,41 +179,35 @@ def fit_drive(
         where = problem.signals.moving(slow, filter.settling)
         fixed.append((recording, Q, e - Q @ (Q.T @ e), filter, where, problem.signals.runs))
 
-    def cost(x: FloatArray) -> float:
-        drive, total, count = DriveLag(*np.abs(x).tolist()), 0.0, 0
+    def unexplained(x: FloatArray) -> FloatArray:
+        parts = []
         for recording, Q, e, filter, where, runs in fixed:
-            u = axis_signals(loop, recording, stride, drive, moves).force
+            u = axis_signals(loop, recording, stride, DriveLag(*(x / rate).tolist()), moves).force
             column = filter.of_acceleration(u, runs)[where]
             column = column - Q @ (Q.T @ column)
-            size = float(column @ column)
-            total += float(e @ e) - (float(column @ e) ** 2 / size if size > 0.0 else 0.0)
-            count += len(e)
-        return count * float(np.log(max(total, np.finfo(np.float64).tiny)))
+            parts.append(e - column * (float(column @ e) / max(float(column @ column), np.finfo(np.float64).tiny)))
+        return np.concatenate(parts)
 
-    grid = [np.array([delay, lag]) for delay in DELAYS_S for lag in LAGS_S]
-    start = min([np.array(known), *grid], key=cost)
-    simplex = start + 0.5 * max(np.diff(DELAYS_S)) * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    optimize_result = minimize(
-        cost, start, method="Nelder-Mead", options={"xatol": 0.02 / rate, "initial_simplex": simplex}
-    )
-    late = DriveLag(*np.abs(optimize_result.x).tolist())
-    matters = cost(np.array(known)) - float(optimize_result.fun) > MIN_DRIVE_GAIN and sum(late) > max(
-        MIN_DRIVE_S, 1.0 / rate
-    )
+    unknown = np.full(2, np.inf)  # samples of delay and lag
+    experiment = Experiment(unexplained, unknown, level_known=False, low=0.0, difference=DRIVE_DIFFERENCE)
+    before = experiment.at(rate * np.array(known))
+    grid = [rate * np.array([delay, lag]) for delay in DELAYS_S for lag in LAGS_S]
+    start = min([before, *map(experiment.at, grid)], key=lambda tried: tried.cost)
+    likely = fit(experiment, start.x)
+    late = DriveLag(*(likely.x / rate).tolist())
+    matters = before.cost - likely.cost > MIN_DRIVE_GAIN and sum(late) > max(MIN_DRIVE_S, 1.0 / rate)
     return late if matters else known
 
 
 def fit_recording(problem: AxisRegression, noise: AxisNoise, slow: float) -> AxisFit:
     """Return the coefficients of one recording by least squares on its innovations."""
     X, e, _ = problem.regress(noise, slow)
-    size = np.linalg.norm(X, axis=0)
-    theta, *_ = np.linalg.lstsq(X / size, e, rcond=None)
-    left = e - X / size @ theta
-    H = np.linalg.inv((X / size).T @ (X / size))
-    lags = round(LONG_RUN_S * problem.signals.sample_rate)
-    G = sum_covariance(X / size * left[:, None], lags)
-    covariance = H @ G @ H
-    return AxisFit(theta / size, covariance / np.outer(size, size), float(left @ left), len(e))
+    scaled, size = normalise_columns(X)
+    theta, *_ = np.linalg.lstsq(scaled, e, rcond=None)
+    left = e - scaled @ theta
+    H = np.asarray(np.linalg.inv(scaled.T @ scaled))
+    G = sum_covariance(scaled * left[:, None], round(LONG_RUN_S * problem.signals.sample_rate))
+    return AxisFit(theta / size, sandwich_covariance(H, G, size))
 
 
 def fit_axis(

@@ -14,8 +14,8 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
 from servoscope.detection.statistic import noncentrality, required_noncentrality, t2_statistic
 from servoscope.estimation.pipeline import Estimates, Pipeline
-from servoscope.estimation.tuning import TuningFit
 from servoscope.evidence.kind import HealthyRecordings
+from servoscope.fit.tuning import TuningFit
 from servoscope.learning.healthy_plant import PlantKnowledge
 from servoscope.learning.inspection.rules import GOOD_EXPLAINED_SHARE, MIN_MEMORIES
 from servoscope.learning.instrument import noise_moments

@@ -27,12 +27,12 @@ from servoscope.estimation.noise_model import (
     AR_ORDER,
     ArmaNoise,
     WhiteNoise,
-    fit_white_noise,
     sample_autocovariance,
     yule_walker,
 )
-from servoscope.estimation.tuning import TuningFit, prefers_white_noise
 from servoscope.evidence.kind import HealthyRecordings
+from servoscope.fit.tuning import TuningFit, prefers_white_noise
+from servoscope.fit.white_noise import fit_white_noise
 from servoscope.learning.innovation_fit import FILE_ERROR, fit_innovations
 from servoscope.models.plants import Plant
 

@@ -12,14 +12,14 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message
 from servoscope.estimation.filter_bank import FilterBank
 from servoscope.estimation.instrument import Source, unbroken
-from servoscope.estimation.instrumental_fit import (
+from servoscope.estimation.pipeline import Pipeline
+from servoscope.fit.instrumental_fit import (
     MAX_RELATIVE_STD,
     InstrumentalFit,
     fit_with_instrument,
     has_feedback,
 )
-from servoscope.estimation.pipeline import Pipeline
-from servoscope.estimation.tuning import TuningFit
+from servoscope.fit.tuning import TuningFit
 from servoscope.models.loop import Loop
 from servoscope.models.lti import autocovariances, solve_scaled
 from servoscope.signals import Recording

@@ -15,12 +15,12 @@ from servoscope.core.messages import Message, message
 from servoscope.estimation import two_stage
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.pipeline import Pipeline, Regression, Tuning
-from servoscope.estimation.tuning import TuningFit, fit_tuning
 from servoscope.evidence.covariates import MIN_SAMPLES_PER_COEFFICIENT, fit_covariates
 from servoscope.evidence.kind import HealthyRecordings
 from servoscope.evidence.population import Population
 from servoscope.evidence.signals import describe_misfit, find_signal_defect
 from servoscope.evidence.warm_up import fit_warm_up
+from servoscope.fit.tuning import TuningFit, fit_tuning
 from servoscope.learning.instrument import learn_instrument, learns_instrument
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from servoscope.baseline.arm import ArmBaseline
-from servoscope.core.messages import translate
+from servoscope.core.messages import say, translate
 from servoscope.diagnosis.arm import ArmExamination
 from servoscope.diagnosis.result import Diagnosis
 from servoscope.report.diagnosis_document import LABELS, diagnosis_document
 from servoscope.report.document import DETAILS, EVIDENCE, PicturePart, Section, to_html
 from servoscope.report.format_values import format_clock_time
-from servoscope.report.page import ResultTable, say, write_page
+from servoscope.report.page import ResultTable, write_page
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,9 +9,9 @@ from matplotlib.figure import Figure
 
 from servoscope.assessment.assess import AssessedSignals, Assessment
 from servoscope.report.format_values import time_axis_unit
-from servoscope.report.plotting import COLOURS, envelope, plot_style
+from servoscope.report.plotting import COLOURS, WIDTH, create_panels, envelope, plot_style
 
-WIDTH, ROW = 9.0, 1.9  # inches
+ROW = 1.9  # inches
 MAX_PERIODS = 12  # in the plot of y over u
 
 
@@ -25,8 +25,7 @@ def plot_assessment(assessment: Assessment) -> Iterator[tuple[str, Figure]]:
 
 @plot_style()
 def _plot_log(signals: AssessedSignals) -> Figure:
-    figure = Figure(figsize=(WIDTH, 2.0 * ROW + 0.6), layout="constrained")
-    top, bottom = figure.subplots(2, 1, sharex=True)
+    figure, (top, bottom) = create_panels(2.0 * ROW + 0.6, 2, sharex=True)
     unit, factor = time_axis_unit(float(signals.t[-1] - signals.t[0]))
     t = (signals.t - signals.t[0]) / factor
     begins = np.zeros(t.size, np.bool_)
@@ -47,8 +46,7 @@ def _plot_log(signals: AssessedSignals) -> Figure:
 
 @plot_style()
 def _plot_orbit(assessment: Assessment, signals: AssessedSignals) -> Figure:
-    figure = Figure(figsize=(WIDTH / 2.0, WIDTH / 2.4), layout="constrained")
-    axis = figure.subplots()
+    figure, axis = create_panels(WIDTH / 2.4, width=WIDTH / 2.0)
     step = float(signals.t[-1] - signals.t[0]) / (signals.t.size - 1)
     shown = signals.t.size
     if assessment.oscillates and assessment.period_s:

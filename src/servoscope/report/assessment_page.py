@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from servoscope.assessment.assess import Assessment
-from servoscope.core.messages import translate
+from servoscope.core.messages import say, translate
 from servoscope.report.format_values import DASH, format_duration, format_percent
-from servoscope.report.page import ResultTable, render_page, say, write_page
+from servoscope.report.page import ResultTable, render_page, write_page
 
 KINDS = {"good": "healthy", "cannot tell": "undetermined"}  # classes of report.css
 

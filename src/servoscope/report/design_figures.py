@@ -9,9 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from servoscope.design import DesignStudy
-from servoscope.report.plotting import COLOURS, plot_style
+from servoscope.report.plotting import COLOURS, create_panels, plot_style
 
-WIDTH = 9.0  # inches
 TONES = ("#1f5fa8", "#c6501c", "#7d8894", "#1c2530")  # one per fault, then again dashed
 RULE = COLOURS["rule"]
 MAX_STD_SHOWN = 30.0  # standard deviation that is worth showing
@@ -26,8 +25,7 @@ def format_log_ratio(value: float) -> str:
 def plot_radii(study: DesignStudy) -> Figure:
     """Draw from which size on each fault is detected, and named; spans that are unclear as bars."""
     rows = [(f, d, getattr(f, d)) for f in study.faults.values() for d in ("up", "down")]
-    figure = Figure(figsize=(WIDTH, 0.9 + 0.34 * len(rows)), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = create_panels(0.9 + 0.34 * len(rows))
     known = [
         abs(math.log(x)) for _, _, s in rows for x in (s.detectable, s.first_isolable, s.bound) if x not in (None, 1.0)
     ]
@@ -61,8 +59,7 @@ def plot_radii(study: DesignStudy) -> Figure:
 @plot_style()
 def plot_size_precision(study: DesignStudy) -> Figure:
     """Draw how the standard deviation of each size falls with the seconds after the onset."""
-    figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = create_panels(3.2)
     for i, fault in enumerate(study.faults.values()):
         tone = TONES[i % len(TONES)]
         known = [(size.seconds, size.std) for size in fault.sizes if size.std is not None]

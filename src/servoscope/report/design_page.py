@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from servoscope.core.messages import count_words, translate
+from servoscope.core.messages import count_words, say, translate
 from servoscope.design import BaselineStudy, DesignStudy
 from servoscope.report.format_values import (
     DASH,
@@ -13,7 +13,7 @@ from servoscope.report.format_values import (
     format_number,
     format_percent,
 )
-from servoscope.report.page import ResultTable, render_page, say, write_page
+from servoscope.report.page import ResultTable, render_page, write_page
 
 MAX_STD_SHOWN = 10.0  # standard deviation from which a number says nothing
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from servoscope.core.messages import clock_of, format_moment, message, render, translate
+from servoscope.core.messages import clock_of, format_moment, message, render, say, translate
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.change_words import fault_label
 from servoscope.diagnosis.ml_refit import MAX_SIZE_DISTANCE, size_distance_std
@@ -42,7 +42,7 @@ from servoscope.report.format_values import (
     parameter_label,
     time_decimals,
 )
-from servoscope.report.page import ResultTable, say
+from servoscope.report.page import ResultTable
 
 MIN_PROBABILITY_SHOWN = 0.01  # probability below which a candidate has no line
 MIN_PROBABILITY_LIKELY = 0.05  # probability from which a candidate counts in sentences

@@ -13,14 +13,14 @@ from matplotlib.patches import Patch
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.messages import translate
 from servoscope.detection.trace import Trace
+from servoscope.diagnosis.motion_signature import MotionSignature
 from servoscope.diagnosis.result import Diagnosis
 from servoscope.estimation.frequency_response import CHI2_95_2DOF, FrequencyResponse
 from servoscope.isolation.candidate import Candidate, FaultEstimate
 from servoscope.report.format_values import axis_scale, text_symbol, time_axis_unit
-from servoscope.report.plotting import COLOURS, envelope, plot_style, robust_range, visible_spans
+from servoscope.report.plotting import COLOURS, WIDTH, create_panels, envelope, plot_style, robust_range, visible_spans
 from servoscope.signals import Recording
 
-WIDTH = 9.0  # inches; the page scales pictures to its own width
 MAX_PATH_POINTS = 1500  # of a path in the complex plane
 MAX_AXES_FACTOR = 2.5  # times the range of 98 % of a path: so far the axes give way to the wildest 2 %
 PAPER, INK, MUTED, RULE = COLOURS["paper"], COLOURS["ink"], COLOURS["muted"], COLOURS["rule"]
@@ -37,8 +37,7 @@ def plot_signals(
     `recording`: signals of any length; long ones are drawn as their envelope; `units`: of the output (and
     reference) and of the input; empty where unknown.
     """
-    figure = Figure(figsize=(WIDTH, 5.0), layout="constrained")
-    axes = figure.subplots(3, 1, sharex=True, height_ratios=[3, 2, 3])
+    figure, axes = create_panels(5.0, 3, 1, sharex=True, height_ratios=[3, 2, 3])
     unit, factor = time_axis_unit(recording.duration_s)
     t = recording.t / factor
     both = ((recording.y, MEASURED, "output y"), (recording.r, REFERENCE, "reference r"))
@@ -72,8 +71,7 @@ def plot_statistic(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
 
     The sequential test is scaled to the threshold of T^2, so that one line is the limit of both.
     """
-    figure = Figure(figsize=(WIDTH, 2.7), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = create_panels(2.7)
     usable = trace.ready & np.isfinite(trace.statistic) & (trace.statistic > 0.0)
     unit, factor = time_axis_unit(float(np.ptp(trace.t)) if len(trace.t) else 0.0)
     ax.set(xlabel=f"time [{unit}]", ylabel="statistic T²")
@@ -121,8 +119,7 @@ def plot_coefficients(trace: Trace, diagnosis: Diagnosis | None = None, *, units
     n = len(trace.names)
     columns = 1 if n == 1 else 2
     rows = -(-n // columns)
-    figure = Figure(figsize=(WIDTH, 0.7 + 1.65 * rows), layout="constrained")
-    axes = figure.subplots(rows, columns, sharex=True, squeeze=False)
+    figure, axes = create_panels(0.7 + 1.65 * rows, rows, columns, sharex=True, squeeze=False)
     unit, factor = time_axis_unit(float(np.ptp(trace.t)) if len(trace.t) else 0.0)
     for i, ax in enumerate(axes.flat):
         if i < n:
@@ -181,8 +178,7 @@ def plot_ifrf(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
     columns = max(1, min(F, 4 if F in (4, 7, 8) else 3))
     rows = max(1, -(-F // columns))
     height = 8.0 / columns if columns > 1 else 4.0
-    figure = Figure(figsize=(WIDTH, 0.5 + height * rows), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False)
+    figure, axes = create_panels(0.5 + height * rows, rows, columns, squeeze=False)
     usable = trace.ready & np.isfinite(trace.theta).all(axis=1)
     onset = diagnosis.onset_s[1] if diagnosis is not None and diagnosis.onset_s is not None else np.inf
     faulty = bool(np.isfinite(onset))
@@ -305,8 +301,7 @@ def plot_fault_sizes(diagnosis: Diagnosis) -> Figure | None:
 
 @plot_style()
 def _single(estimate: FaultEstimate, other: FaultEstimate | None) -> Figure:
-    figure = Figure(figsize=(WIDTH, 1.25 if other is not None else 1.0), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = create_panels(1.25 if other is not None else 1.0)
     shown = [("refit", estimate, MEASURED), *([("recursion", other, HEALTHY)] if other is not None else [])]
     for i, (_, fault, colour) in enumerate(shown):
         _interval(ax, fault, -i, colour)
@@ -355,3 +350,31 @@ def _joint(ax: Axes, best: Candidate) -> None:
     ax.set_title("both at once, 95 %", loc="left", fontweight="bold")
     ax.locator_params(nbins=4)
     ax.grid(visible=True, color=RULE, linewidth=0.6)
+
+
+@plot_style()
+def plot_signature(
+    before: MotionSignature | None, after: MotionSignature, *, units: tuple[str, str] = ("", "")
+) -> Figure:
+    """Draw mean u over position, forward and backward, and over speed; `units`: of the output and of the input."""
+    figure, (of_position, of_speed) = create_panels(3.2, 1, 2, sharey=True)
+    shown = [(before, COLOURS["healthy"], "before"), (after, COLOURS["measured"], "after" if before else "measured")]
+    kept = [(signature, colour, words) for signature, colour, words in shown if signature is not None]
+    y_unit, y_scale = axis_scale([signature.position for signature, *_ in kept], units[0])
+    v_unit, v_scale = axis_scale([signature.speed for signature, *_ in kept], f"{units[0]}/s" if units[0] else "")
+    u_unit, u_scale = axis_scale([signature.by_speed for signature, *_ in kept], units[1])
+    for signature, colour, _ in kept:
+        of_position.plot(y_scale * signature.position, u_scale * signature.forward, color=colour)
+        of_position.plot(y_scale * signature.position, u_scale * signature.backward, color=colour, linestyle="--")
+        of_speed.plot(v_scale * signature.speed, u_scale * signature.by_speed, color=colour, marker="o", markersize=2.5)
+    of_position.set_xlabel(f"output y [{y_unit}]" if y_unit else "output y")
+    of_position.set_ylabel(f"mean u [{u_unit}]" if u_unit else "mean u")
+    of_speed.set_xlabel(f"speed of y [{v_unit}]" if v_unit else "speed of y")
+    for ax in (of_position, of_speed):
+        ax.axhline(0.0, color=COLOURS["rule"], linewidth=0.7, zorder=0)
+    of_speed.axvline(0.0, color=COLOURS["rule"], linewidth=0.7, zorder=0)
+    lines = [Line2D([], [], color=colour, label=words) for _, colour, words in kept]
+    lines.append(Line2D([], [], color=COLOURS["muted"], label="forward"))
+    lines.append(Line2D([], [], color=COLOURS["muted"], linestyle="--", label="backward"))
+    figure.legend(handles=lines, loc="outside upper left", ncols=len(lines))
+    return figure

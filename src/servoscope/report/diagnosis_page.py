@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from servoscope.baseline.baseline import Baseline
-from servoscope.core.messages import translate
+from servoscope.core.messages import say, translate
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.diagnosis.motion_signature import MotionSignature, SignatureWidth, compare_signatures
@@ -18,7 +18,7 @@ from servoscope.models.loop import Loop
 from servoscope.report.diagnosis_document import LABELS, DiagnosisContext, diagnosis_document
 from servoscope.report.document import DETAILS, HEADLINE, Section, to_html
 from servoscope.report.format_values import DASH, format_clock_time, format_count, format_quantity, format_with_std
-from servoscope.report.page import ResultTable, render_page, say, write_page
+from servoscope.report.page import ResultTable, render_page, write_page
 from servoscope.report.plain_values import provenance
 from servoscope.report.plots import plot
 from servoscope.signals import Recording
@@ -135,7 +135,6 @@ def _figures(
 ) -> Iterator[tuple[str, Figure]]:
     """Yield the pictures of the document by name."""
     from servoscope.report import diagnosis_figures as figures
-    from servoscope.report.signature_figure import plot_signature
 
     yield "statistic", figures.plot_statistic(trace, diagnosis)
     yield "signals", figures.plot_signals(recording, diagnosis, units=loop.plant.units)
@@ -146,7 +145,7 @@ def _figures(
         yield "sizes", sizes
     before, after = signatures
     if after is not None:
-        yield "signature", plot_signature(before, after, units=loop.plant.units)
+        yield "signature", figures.plot_signature(before, after, units=loop.plant.units)
 
 
 def _widths(

@@ -12,10 +12,10 @@ from servoscope.learning.inspection import Inspection
 from servoscope.learning.inspection.inspect import InspectionTraces
 from servoscope.report.diagnosis_figures import plot_signals
 from servoscope.report.format_values import time_axis_unit
-from servoscope.report.plotting import COLOURS, envelope, plot_style, robust_range, visible_spans
+from servoscope.report.plotting import COLOURS, create_panels, envelope, plot_style, robust_range, visible_spans
 from servoscope.signals import Recording
 
-WIDTH, ROW = 9.0, 1.9  # inches
+ROW = 1.9  # inches
 COLOUR_OF_SIGNAL = {"r": COLOURS["healthy"], "u": COLOURS["care"], "y": COLOURS["measured"]}
 ALARM, MUTED = COLOURS["alarm"], COLOURS["muted"]
 
@@ -31,8 +31,7 @@ def plot_inspection(inspection: Inspection, recording: Recording) -> Iterator[tu
 
 
 def _two_rows(*, share_x: bool) -> tuple[Figure, Axes, Axes]:
-    figure = Figure(figsize=(WIDTH, 2.0 * ROW + 0.6), layout="constrained")
-    top, bottom = figure.subplots(2, 1, sharex=share_x)
+    figure, (top, bottom) = create_panels(2.0 * ROW + 0.6, 2, sharex=share_x)
     for axis in (top, bottom):
         axis.grid(visible=True, color=COLOURS["rule"], linewidth=0.6)
         axis.margins(x=0.01)

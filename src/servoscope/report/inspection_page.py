@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from servoscope.core.messages import translate
+from servoscope.core.messages import say, translate
 from servoscope.learning.inspection import Inspection
 from servoscope.models.loop import Loop
 from servoscope.report.format_values import DASH, format_duration, format_percent
-from servoscope.report.page import ResultTable, render_page, say, write_page
+from servoscope.report.page import ResultTable, render_page, write_page
 from servoscope.signals import Recording
 
 KINDS = {"usable": "healthy", "usable with care": "care", "not usable": "fault"}  # classes of report.css

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from servoscope.core import messages
 from servoscope.core.errors import OutputError
 from servoscope.core.files import atomic_write
-from servoscope.core.messages import message, render, translate, translate_range
+from servoscope.core.messages import say, translate, translate_range
 from servoscope.report import format_values
 
 if TYPE_CHECKING:
@@ -113,11 +113,6 @@ def _printed(page: bytes, path: str | Path) -> bytes:
             return printed.read_bytes()
         except (OSError, subprocess.SubprocessError) as error:
             raise OutputError(say("report.not_printed", path=str(path), error=type(error).__name__)) from None
-
-
-def say(key: str, **values: Any) -> str:
-    """Return a message of the catalogue as text."""
-    return render(message(key, **values))
 
 
 @functools.cache

@@ -55,6 +55,7 @@ STYLE: dict[str, Any] = {
     "ytick.color": COLOURS["muted"],
     "ytick.labelcolor": COLOURS["ink"],
 }
+WIDTH = 9.0  # inches; a page scales pictures to its own width
 COLUMNS = 1200  # of an envelope
 FORMATS = ("svg", "png", "pdf")
 
@@ -70,6 +71,14 @@ def plot_style(fonttype: str = "path") -> Iterator[None]:
         matplotlib.rcdefaults()
         parameters.update(STYLE | {"svg.fonttype": fonttype})
         yield
+
+
+def create_panels(
+    height: float, rows: int = 1, columns: int = 1, *, width: float = WIDTH, **options: Any
+) -> tuple[Figure, Any]:
+    """Return a figure of a size in inches with its axes: one, or an array; options are those of matplotlib."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots(rows, columns, **options)
 
 
 def envelope(

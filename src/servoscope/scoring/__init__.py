@@ -1,7 +1,6 @@
 """How good a detector or a diagnosis is: pure functions on arrays, and dummies to put beside the real thing."""
 
 from servoscope.scoring.alarms import Detections, alarm_rate, detections, events
-from servoscope.scoring.damadics import FaultIndices, fault_indices
 from servoscope.scoring.dummies import DUMMIES, Detector, always, cusum, never
 from servoscope.scoring.intervals import Measured, coverage, discoveries, share
 from servoscope.scoring.isolation import Reliability, accuracy, brier_score, confusion, log_score, reliability
@@ -20,7 +19,6 @@ __all__ = [
     "DUMMIES",
     "Detections",
     "Detector",
-    "FaultIndices",
     "Measured",
     "Reliability",
     "RunLengths",
@@ -35,7 +33,6 @@ __all__ = [
     "detections",
     "discoveries",
     "events",
-    "fault_indices",
     "log_score",
     "lorden_bound",
     "needed_information",

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from servoscope.core.messages import message, translate
+from servoscope.core.messages import message, say, translate
 from servoscope.diagnosis.change_words import change_messages
 from servoscope.diagnosis.result import Diagnosis
 from servoscope.report.diagnosis_document import DiagnosisContext, diagnosis_document, size_fact
 from servoscope.report.document import HEADLINE, Document, Fact, Facts, Notes, Section
 from servoscope.report.format_values import format_duration, format_probability
-from servoscope.report.page import say
 from servoscope.service.alarms import FAULT_ALARM
 from servoscope.service.assets.status import AssetStatus
 from servoscope.signals import quality

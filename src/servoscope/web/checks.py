@@ -20,7 +20,7 @@ from servoscope.service.store.series import read_checks
 from servoscope.web.asset_document import has_open_fault
 from servoscope.web.dependencies import Context
 from servoscope.web.routes.baselines import asset_baseline_id, find_baseline, load_cached
-from servoscope.web.schemas.checks import FaultCheck
+from servoscope.web.schemas.responses import FaultCheck
 from servoscope.web.stored_diagnosis import read_diagnosis
 
 

@@ -6,8 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated
 
-from fastapi import Depends, Request
-from starlette.exceptions import HTTPException
+from fastapi import Depends, HTTPException, Request
 
 from servoscope.service.access import Role, Session, Sessions, Users, WebSettings, is_permitted
 from servoscope.service.config import ServiceFile

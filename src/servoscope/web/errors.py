@@ -14,7 +14,7 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse, Response
 
 from servoscope.core.errors import AlarmError, ServoscopeError, StoreError
-from servoscope.core.messages import message, render
+from servoscope.core.messages import say
 from servoscope.web.schemas.responses import JsonObject, Problem
 
 PROBLEM_TYPE = "application/problem+json"
@@ -83,7 +83,7 @@ def install_error_handlers(app: FastAPI) -> None:
         errors = [
             {"where": ".".join(map(str, problem["loc"])), "what": str(problem["msg"])} for problem in error.errors()
         ]
-        detail = f"{errors[0]['where']}: {errors[0]['what']}" if errors else render(message("web.invalid"))
+        detail = f"{errors[0]['where']}: {errors[0]['what']}" if errors else say("web.invalid")
         return problem_response(422, detail, request.url.path, errors)
 
     @app.exception_handler(ServoscopeError)
@@ -94,9 +94,9 @@ def install_error_handlers(app: FastAPI) -> None:
 
     @app.exception_handler(ClientDisconnect)
     async def _incomplete(request: Request, _: ClientDisconnect) -> Response:
-        return problem_response(400, render(message("web.incomplete")), request.url.path)
+        return problem_response(400, say("web.incomplete"), request.url.path)
 
     @app.exception_handler(Exception)
     async def _unexpected(request: Request, error: Exception) -> Response:
         logging.getLogger("servoscope.web").error("%s %s", request.method, request.url.path, exc_info=error)
-        return problem_response(500, render(message("web.unexpected")), request.url.path)
+        return problem_response(500, say("web.unexpected"), request.url.path)

@@ -11,9 +11,9 @@ from rich.text import Text
 from servoscope.assessment.assess import Assessment
 from servoscope.assessment.plant_loops import group_by_period
 from servoscope.cli.render.results import INDENT, print_facts, print_notes, print_result_table, print_title
-from servoscope.core.messages import translate
+from servoscope.core.messages import say, translate
 from servoscope.report.assessment_page import assessment_size, facts, index_table, ranking_table
-from servoscope.report.page import ResultTable, say
+from servoscope.report.page import ResultTable
 
 __all__ = ["print_assessment", "print_ranking", "ranking_table"]
 

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from rich.console import Console
 
 from servoscope.cli.render.results import print_facts, print_notes, print_result_table, print_table, print_title
+from servoscope.core.messages import say
 from servoscope.design import BaselineStudy, DesignStudy
 from servoscope.design.result import DirectionStudy
 from servoscope.report import design_page
 from servoscope.report.format_values import format_change, format_duration
-from servoscope.report.page import say
 
 
 def print_study(out: Console, s: DesignStudy) -> None:

@@ -17,12 +17,12 @@ from servoscope.cli.render.results import (
     print_result_table,
     print_title,
 )
-from servoscope.core.messages import translate
+from servoscope.core.messages import say, translate
 from servoscope.diagnosis.result import Diagnosis
 from servoscope.report.diagnosis_document import diagnosis_document
 from servoscope.report.document import EVIDENCE, HEADLINE, Document, Facts, Notes, Section, with_pictures
 from servoscope.report.format_values import format_duration
-from servoscope.report.page import ResultTable, say
+from servoscope.report.page import ResultTable
 
 MAX_TEXT_WIDTH = 100  # of what `print` of a diagnosis shows
 

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from rich.console import Console
 from rich.text import Text
 
 from servoscope.cli.render.results import COLOURS, print_facts, print_notes, print_table
-from servoscope.core.messages import count_words, translate, translate_range
+from servoscope.core.messages import count_words, say, translate, translate_range
 from servoscope.core.number_format import format_ratios
+from servoscope.fleet import Fleet
+from servoscope.fleet.report import describe_discoveries, headline
 from servoscope.report.format_values import DASH, format_probability
-from servoscope.report.page import say
-
-if TYPE_CHECKING:
-    from servoscope.fleet import Fleet
 
 MAX_ASSETS_SHOWN = 20
 MIN_PROBABILITY_SHOWN = 0.05  # probability of a common cause that is worth its line
@@ -22,8 +18,6 @@ MIN_PROBABILITY_SHOWN = 0.05  # probability of a common cause that is worth its 
 
 def print_fleet(out: Console, f: Fleet) -> None:
     """Print what a fleet's results say."""
-    from servoscope.fleet.report import describe_discoveries, headline
-
     colour = COLOURS["fault" if f.count("fault") or f.accepted else "healthy"]
     out.print(Text.assemble((count_words(len(f.assets), "asset"), "bold"), ": ", (headline(f), f"bold {colour}")))
     if told := describe_discoveries(f):

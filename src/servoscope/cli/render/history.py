@@ -12,10 +12,9 @@ from rich.table import Table
 from rich.text import Text
 
 from servoscope.cli.render.results import COLOURS, build_table
-from servoscope.core.messages import translate
+from servoscope.core.messages import say, translate
 from servoscope.core.number_format import format_rough
 from servoscope.report.format_values import DASH, format_duration, plain_name
-from servoscope.report.page import say
 from servoscope.service.store.queries import format_time
 
 if TYPE_CHECKING:

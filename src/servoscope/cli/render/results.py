@@ -17,12 +17,12 @@ from rich.table import Table
 from rich.text import Text
 
 from servoscope.baseline.baseline import Baseline
-from servoscope.core.messages import translate, translate_range
+from servoscope.core.messages import say, translate, translate_range
 from servoscope.core.number_format import format_rough
 from servoscope.learning.inspection import Inspection
 from servoscope.models.loop import Columns
 from servoscope.report.format_values import DASH, format_duration, format_percent
-from servoscope.report.page import ResultTable, say
+from servoscope.report.page import ResultTable
 from servoscope.signals import Recording
 from servoscope.signals.readers import ChannelInfo
 from servoscope.simulation import Truth

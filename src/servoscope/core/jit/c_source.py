@@ -44,7 +44,7 @@ class _Statement(NamedTuple):
 class CPrinter:
     """Writes each operation down as a statement; with `single`, numbers are floats where nothing else is said.
 
-    Another language is a subclass with its own literals, assignments, selections, calls and blocks. `variables` are
+    Another language is a subclass with its own literals, operators, calls and `FORMS` of statements. `variables` are
     those that it needs beside the constants: their names and kinds.
     """
 
@@ -52,7 +52,6 @@ class CPrinter:
         **{"fadd": "+", "fsub": "-", "fmul": "*", "fdiv": "/", "and": "&", "or": "|"},
         **{"add": "+", "sub": "-", "mul": "*", "urem": "%", "==": "=="},
     }
-    SELECT = "({0} != 0) ? {1} : {2}"
     # The larger and smaller of two numbers as comparisons: that is one instruction of a processor, which ISO C's fmax,
     # with its rule for NaN, is not.
     CALLS: ClassVar[dict[str, str]] = {
@@ -63,8 +62,12 @@ class CPrinter:
         "minnum": "({0} < {1}) ? {0} : {1}",
     }
     WORDS: ClassVar[dict[str, str]] = {"i1": "int", "i64": "int", "double": "double", "float": "float"}
-    LOOP = "for ({0} = {1}; {0} < {2}; {0}++) {{", "}"
-    BRANCH = "if ({0} != 0) {{", "}"
+    FORMS: ClassVar[dict[str, str]] = {
+        **{"declare": "{1} {0} = 0;", "define": "const {2} {0} = {1};", "store": "{0} = {1};"},
+        **{"select": "({0} != 0) ? {1} : {2}", "number": "(double){0}", "truncate": "(int){0}"},
+        **{"loop": "for ({0} = {1}; {0} < {2}; {0}++) {{", "end loop": "}"},
+        **{"branch": "if ({0} != 0) {{", "end branch": "}"},
+    }
 
     def __init__(self, single: bool = False) -> None:
         self.kind = "float" if single else "double"
@@ -92,23 +95,14 @@ class CPrinter:
 
     def declarations(self) -> list[str]:
         """Return the declarations of the variables."""
-        return [f"{self.WORDS[kind]} {name} = 0;" for name, kind in self.variables.items()]
+        form = self.FORMS["declare"]
+        return [form.format(name, self.WORDS[kind]) for name, kind in self.variables.items() if form]
 
-    # what differs between languages
+    # operations
 
     def literal(self, number: float, kind: str) -> str:
         """Return how a number is written."""
         return c_literal(number, kind == "float")
-
-    def assignment(self, place: str, text: str) -> str:
-        """Return the statement that writes a value to a place."""
-        return f"{place} = {text};"
-
-    def definition(self, name: str, text: str, kind: str) -> str:
-        """Return the statement that makes a number or a condition."""
-        return f"const {self.WORDS[kind]} {name} = {text};"
-
-    # operations
 
     def constant(self, number: float, kind: str) -> str:
         """Return a constant."""
@@ -138,7 +132,7 @@ class CPrinter:
 
     def select(self, condition_kind: str, condition: str, kind: str, a: str, b: str) -> str:
         """Write a where the condition holds, b where not."""
-        return self._assign(self.SELECT.format(condition, a, b), kind)
+        return self._assign(self.FORMS["select"].format(condition, a, b), kind)
 
     def call(self, name: str, kind: str, arguments: Sequence[str]) -> str:
         """Write a call of a function."""
@@ -147,11 +141,11 @@ class CPrinter:
 
     def truncate(self, number: Float) -> Int:
         """Return a number without what follows its point."""
-        return Int(self, self._assign(f"(int){number.text}", "i64"))
+        return Int(self, self._assign(self.FORMS["truncate"].format(number.text), "i64"))
 
     def number(self, whole: Int) -> Float:
         """Return a whole number as a number."""
-        return Float(self, self._assign(f"(double){whole}", "double"), "double")
+        return Float(self, self._assign(self.FORMS["number"].format(whole), "double"), "double")
 
     # places, loops and branches
 
@@ -161,7 +155,7 @@ class CPrinter:
 
     def store(self, kind: str, text: str, place: str) -> None:
         """Write a number to a place."""
-        self._statements.append(_Statement("", self.assignment(place, text)))
+        self._statements.append(_Statement("", self.FORMS["store"].format(place, text)))
 
     def variable(self, kind: str) -> str:
         """Return the place of a number that changes."""
@@ -172,26 +166,26 @@ class CPrinter:
     def loop(self, begin: Int | int, end: Int | int, step: int = 1) -> Iterator[Int]:
         """Write a loop over whole numbers."""
         name = self.variable("i64")
-        with self._block(self.LOOP, name, begin, end):
+        with self._block("loop", name, begin, end):
             yield Int(self, name)
 
     def when(self, condition: Bool) -> contextlib.AbstractContextManager[None]:
         """Write what happens only where a condition holds."""
-        return self._block(self.BRANCH, condition.text)
+        return self._block("branch", condition.text)
 
     @contextlib.contextmanager
-    def _block(self, words: tuple[str, str], *names: Any) -> Iterator[None]:
+    def _block(self, kind: str, *names: Any) -> Iterator[None]:
         known = dict(self._known)
-        self._statements.append(_Statement("", words[0].format(*names)))
+        self._statements.append(_Statement("", self.FORMS[kind].format(*names)))
         yield
-        self._statements.append(_Statement("", words[1]))
+        self._statements.append(_Statement("", self.FORMS[f"end {kind}"]))
         self._known = known  # what was computed inside is not known outside
 
     def _assign(self, text: str, kind: str, pure: bool = True) -> str:
         if pure and text in self._known:
             return self._known[text]
         target = f"{'b' if kind == 'i1' else 'k' if kind == 'i64' else 't'}{len(self._statements)}"
-        self._statements.append(_Statement(target, self.definition(target, text, kind)))
+        self._statements.append(_Statement(target, self.FORMS["define"].format(target, text, self.WORDS[kind])))
         if pure:
             self._known[text] = target
         return target

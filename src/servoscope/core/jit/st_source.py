@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 from servoscope.core.jit.c_source import CPrinter
-from servoscope.core.jit.symbolic import Float, Int
 
 __all__ = ["STPrinter", "st_literal"]
 
@@ -35,31 +34,23 @@ class STPrinter(CPrinter):
     """Writes operations down as statements of Structured Text."""
 
     OPERATORS: ClassVar[dict[str, str]] = CPrinter.OPERATORS | {"and": "AND", "or": "OR", "urem": "MOD", "==": "="}
-    SELECT = "SEL({0}, {2}, {1})"
     CALLS: ClassVar[dict[str, str]] = {
         "fabs": "ABS({})",
         "sqrt": "SQRT({})",
         "maxnum": "SEL({0} > {1}, {1}, {0})",
         "minnum": "SEL({0} < {1}, {1}, {0})",
     }
-    LOOP = "FOR {0} := {1} TO {2} - 1 DO", "END_FOR;"
-    BRANCH = "IF {0} THEN", "END_IF;"
+    FORMS: ClassVar[dict[str, str]] = {
+        # a function block declares the variables of all its statements together
+        **{"declare": "", "define": "{0} := {1};", "store": "{0} := {1};"},
+        **{"select": "SEL({0}, {2}, {1})", "number": "DINT_TO_LREAL({0})", "truncate": "TRUNC({0})"},
+        **{"loop": "FOR {0} := {1} TO {2} - 1 DO", "end loop": "END_FOR;"},
+        **{"branch": "IF {0} THEN", "end branch": "END_IF;"},
+    }
 
     def literal(self, number: float, kind: str) -> str:
         """Return how a number is written."""
         return st_literal(number)
-
-    def assignment(self, place: str, text: str) -> str:
-        """Return the statement that writes a value to a place."""
-        return f"{place} := {text};"
-
-    def definition(self, name: str, text: str, kind: str) -> str:
-        """Return the statement that makes a number or a condition; its variable is declared elsewhere."""
-        return self.assignment(name, text)
-
-    def declarations(self) -> list[str]:
-        """Return nothing: a function block declares the variables of all its statements together."""
-        return []
 
     def convert(self, kind: str, a: str, target: str) -> str:
         """Return a number as it is: there is one precision."""
@@ -71,11 +62,3 @@ class STPrinter(CPrinter):
             a, b, c = arguments
             return self.operate("fadd", kind, self.operate("fmul", kind, a, b), c)
         return super().call(name, kind, arguments)
-
-    def number(self, whole: Int) -> Float:
-        """Return a whole number as a number."""
-        return Float(self, self._assign(f"DINT_TO_LREAL({whole})", "double"), "double")
-
-    def truncate(self, number: Float) -> Int:
-        """Return a number without what follows its point."""
-        return Int(self, self._assign(f"TRUNC({number.text})", "i64"))

@@ -298,6 +298,11 @@ def render(given: Message, language: str | None = None) -> str:
     return _Renderer(language).vformat(template(given.key, language), (), given.values)
 
 
+def say(key: str, **values: Any) -> str:
+    """Return a message of the catalogue as text, in the current language."""
+    return render(message(key, **values))
+
+
 def count_words(count: float | str, noun: str, language: str | None = None) -> str:
     """Return a number of things, 1 row or 2 rows; `noun` is a name of the section ``count`` of the catalogue."""
     singular, _, several = render(message(f"count.{noun}", count=count), language).partition("|")

@@ -14,6 +14,7 @@ class KernelSizes(NamedTuple):
 
     n: int
     rows: int
+    inputs: int  # no step reads it, but fingerprints of exported monitors count it
     states: int
     speed: int
     gated: bool

@@ -1,5 +1,5 @@
 /*
- * Self-test of @{prefix}.c: the golden samples have to lead to the golden results, @{agreement}.
+ * Self-test of @{prefix}.c: the golden samples have to lead to the golden results, @{"T^2 within " ~ tolerance if made.covariates else "bit by bit"}.
  * Run it with `make check`.
  *
  * It prints the bytes of state and constants and the time of a sample, in cycles too where it knows a counter of them,
@@ -178,6 +178,6 @@ int main(void)
         printf("WRONG: %lu results differ, the first at sample %lu\n", (unsigned long)wrong, (unsigned long)first);
         return 1;
     }
-    printf("ok: %d samples, %d evaluations, @{agreement}\n", GOLDEN_SAMPLES, GOLDEN_EVALUATIONS);
+    printf("ok: %d samples, %d evaluations, @{"T^2 within " ~ tolerance if made.covariates else "bit by bit"}\n", GOLDEN_SAMPLES, GOLDEN_EVALUATIONS);
     return 0;
 }

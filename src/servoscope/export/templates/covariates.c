@@ -1,32 +1,32 @@
 /* covariates: x = (average - middle) / half, and its powers; they move theta by slopes, or their logarithms */
-#define POWERS @{powers}
-#define KEEP @{keep} /* of an average, per sample */
+#define POWERS @{made.covariates.model.slopes | length}
+#define KEEP @{made.covariates.average.keep | c} /* of an average, per sample */
 #define VALUES AT_COVARIATES
 #define AVERAGES (VALUES + @{upper}_COVARIATES) /* 2 each; the second stays 0, as in the program on the server */
 #define AGES (AVERAGES + (2 * @{upper}_COVARIATES))
 
 static const double known_range[@{upper}_COVARIATES][2] = {
-@{known_range}
+@{tables.known_range | table}
 };
 static const double learned[@{upper}_COVARIATES][2] = { /* middle, half */
-@{learned}
+@{tables.learned | table}
 };
-static const int degrees[@{upper}_COVARIATES] = {@{degrees}};
-static const int proportional[@{upper}_COEFFICIENTS] = {@{proportional}};
+static const int degrees[@{upper}_COVARIATES] = {@{made.covariates.model.degrees | join(", ")}};
+static const int proportional[@{upper}_COEFFICIENTS] = {@{made.covariates.model.proportional | map("int") | join(", ")}};
 static const double slopes[POWERS][@{upper}_COEFFICIENTS] = {
-@{slopes}
+@{tables.slopes | table}
 };
 static const double slope_covariance[POWERS * @{upper}_COEFFICIENTS][POWERS * @{upper}_COEFFICIENTS] = {
-@{slope_covariance}
+@{tables.slope_covariance | table}
 };
-static const double theta_middle[@{upper}_COEFFICIENTS] = {@{theta_middle}};
-static const double theta_expected[@{upper}_COEFFICIENTS] = {@{theta_expected}}; /* without the bias of the regression */
-static const double theta_origin[@{upper}_COEFFICIENTS] = {@{theta_origin}};
+static const double theta_middle[@{upper}_COEFFICIENTS] = {@{tables.theta_middle.tolist() | map("c") | join(", ")}};
+static const double theta_expected[@{upper}_COEFFICIENTS] = {@{tables.theta_expected.tolist() | map("c") | join(", ")}}; /* without the bias of the regression */
+static const double theta_origin[@{upper}_COEFFICIENTS] = {@{tables.theta_origin.tolist() | map("c") | join(", ")}};
 static const double to_state[@{upper}_COEFFICIENTS][@{upper}_COEFFICIENTS] = {
-@{to_state}
+@{tables.to_state | table}
 };
 static const double to_response[2 * @{upper}_FREQUENCIES][@{upper}_COEFFICIENTS] = {
-@{to_response}
+@{tables.to_response | table}
 };
 
 void @{prefix}_covariates(@{prefix}_state *state, const double values[@{upper}_COVARIATES])

@@ -1,6 +1,6 @@
 /* Covariates: what a healthy loop shows moves with them. */
-#define @{upper}_COVARIATES @{covariate_count} /* @{covariate_names} */
-#define @{upper}_COVARIATE_HOLD @{covariate_hold} /* samples for which a value holds without a new one */
+#define @{upper}_COVARIATES @{made.covariates.model.names | length} /* @{made.covariates.model.names | join(", ") | plain} */
+#define @{upper}_COVARIATE_HOLD @{made.covariates.hold | c} /* samples for which a value holds without a new one */
 
 typedef enum {
     @{upper}_KNOWN = 0,

@@ -3,8 +3,8 @@
 #define SIGNAL_U 1
 #define SIGNAL_Y 2
 #define SIGNAL_E 3
-#define WINDOW @{window}u /* samples */
-#define EPOCH_WINDOWS @{epoch_windows}u /* after which ranges are forgotten */
+#define WINDOW @{limits.window}u /* samples */
+#define EPOCH_WINDOWS @{quality.EPOCH_WINDOWS}u /* after which ranges are forgotten */
 
 static double width(const double range[2])
 {
@@ -40,12 +40,12 @@ static void recent_range(const @{prefix}_signals *s, int i, double range[2])
 /* Tell whether a signal went further than i does without moving: a share of its range, a few of its smallest changes. */
 static int has_moved(const @{prefix}_signals *s, const double range[2], int i)
 {
-    const double steps = @{motion_steps} * s->smallest_change[i];
+    const double steps = @{quality.MOTION_STEPS | c} * s->smallest_change[i];
     double all[2];
     double share;
 
     recent_range(s, i, all);
-    share = @{motion_share} * width(all);
+    share = @{quality.MOTION_SHARE | c} * width(all);
     return width(range) > ((share > steps) ? share : steps);
 }
 
@@ -57,8 +57,8 @@ static void learn_rest_noise(@{prefix}_signals *s, double y, int turned)
     if (anew != 0) {
         /* the first stretch of a rest is left for the motion to settle */
         if ((s->same[SIGNAL_R] > (2u * @{upper}_FROZEN_SAMPLES)) &&
-            ((double)s->turns >= (@{turn_share} * (double)@{upper}_FROZEN_SAMPLES)) &&
-            (width(s->y_at_rest) >= (@{noise_levels} * s->smallest_change[SIGNAL_Y]))) {
+            ((double)s->turns >= (@{quality.TURN_SHARE | c} * (double)@{upper}_FROZEN_SAMPLES)) &&
+            (width(s->y_at_rest) >= (@{quality.NOISE_LEVELS | c} * s->smallest_change[SIGNAL_Y]))) {
             s->noisy = 1;
         }
         s->turns = 0u;
@@ -87,14 +87,14 @@ static int y_should_move(const @{prefix}_signals *s)
 /* Tell whether the controller has had to act; at the end of its range u is limited, and not frozen. */
 static int u_should_move(const @{prefix}_signals *s, double u)
 {
-    const double steps = @{motion_steps} * s->smallest_change[SIGNAL_U];
+    const double steps = @{quality.MOTION_STEPS | c} * s->smallest_change[SIGNAL_U];
     double of_u[2];
     double of_e[2];
     double share;
 
     recent_range(s, SIGNAL_U, of_u);
     recent_range(s, SIGNAL_E, of_e);
-    share = @{motion_share} * width(of_e);
+    share = @{quality.MOTION_SHARE | c} * width(of_e);
     return (of_u[0] < u) && (u < of_u[1]) && (width(of_u) > steps) && (width(s->e_while_u) > share) &&
            (has_moved(s, s->y_while_u, SIGNAL_Y) != 0);
 }
@@ -180,3 +180,4 @@ int @{prefix}_frozen(@{prefix}_signals *signals, @{number} r, @{number} u, @{num
     }
     return ((signals->frozen_y != 0) ? @{upper}_FROZEN_Y : 0) + ((signals->frozen_u != 0) ? @{upper}_FROZEN_U : 0);
 }
+

@@ -29,40 +29,74 @@
 /* places in the state */
 #define SAMPLE @{sample}
 #define ARMED @{armed}
-@{places}/* status of a sample */
+@@ for i, place in places.items() if " " not in place
+#define @{place} @{i}
+@@ endfor
+@@ if size.watched
+#define CUSUMS @{size.floats}
+@@ endif
+@@ if not size.steady
+#define PRIVATE @{size.floats + size.watched}
+@@ endif
+@@ if made.covariates
+#define AT_COVARIATES @{covariate_place}
+@@ endif
+/* status of a sample */
 #define MISSING (-1.0)
 #define USED 1.0
 #define BETWEEN 2.0
 
 #define MAX_PHYSICAL @{max_physical}
 #define STRIDE @{stride}u /* samples per update */
-#define LIMIT @{limit}
+#define LIMIT @{made.baseline.thresholds.statistic | c(single)}
 #define ON_DELAY @{on_delay}.0 /* evaluations */
 #define OFF_DELAY @{off_delay}.0
 
-@{constants}
+static const @{number} c[@{made.table | length}] = {
+@@ for begin, end, name in sections
+    /* @{begin}: @{name} */
+@{made.table[begin:end].tolist() | map("c", single) | wrapped},
+@@ endfor
+};
 
-const double @{prefix}_frequencies[@{upper}_FREQUENCIES] = {@{frequency_list}};
+const double @{prefix}_frequencies[@{upper}_FREQUENCIES] = {@{made.baseline.loop.monitor.frequencies | map("c") | join(", ")}};
 const @{number} @{prefix}_limit = LIMIT;
 
 static const @{prefix}_residual healthy[@{upper}_FREQUENCIES] = {
-@{healthy}
+@@ for H in made.healthy.H
+    {@{H.real | c(single)}, @{H.imag | c(single)}}@{"" if loop.last else ","}
+@@ endfor
 };
 
-static const unsigned char fingerprint[8] = {@{fingerprint}};
+static const unsigned char fingerprint[8] = {@{mark | join(", ")}};
 
-@{functions}
+@{functions | join("\n\n")}
 
 /* Take one sample through filters, estimator, covariance and sequential test. */
 static void process(@{prefix}_state *state, @{number} r, @{number} u, @{number} y, double restart)
 {
     double *h = state->counters;
     @{number} *s = state->numbers;
-@{locals}
+    @{number} v[@{size.rows}] = {@{([zero] * size.rows) | join(", ")}};
+    @{number} shadow[@{made.spec.shadow_rows}] = {@{([zero] * made.spec.shadow_rows) | join(", ")}};
+    @{number} e[2] = {@{zero}, @{zero}};
+    double status[1] = {MISSING};
+@@ if size.watched
+    @{number} *g = &s[CUSUMS];
+    @{number} top[1];
+@@ endif
+@@ if size.watched and not made.spec.sums
+    @{number} w[@{made.spec.columns + 1}];
+    double when[1];
+@@ endif
     const uint64_t number = (uint64_t)h[SAMPLE];
     const int due = ((number + 1u) % STRIDE) == 0u;
 
-@{before}
+@@ if size.shadow
+    if ((number % @{every}u) == 0u) {
+        begin_evaluation(s, h);
+    }
+@@ endif
     h[SAMPLE] = h[SAMPLE] + 1.0;
     if ((@{fabs}(r) < MAX_PHYSICAL) && (@{fabs}(u) < MAX_PHYSICAL) && (@{fabs}(y) < MAX_PHYSICAL)) {
         if ((restart > 0.0) || (h[ARMED] <= 0.0)) {
@@ -74,19 +108,31 @@ static void process(@{prefix}_state *state, @{number} r, @{number} u, @{number} 
         status[0] = MISSING;
     }
     if ((status[0] >= USED) && (status[0] <= USED)) {
-        @{update}
+        update_estimate(s, h, v, shadow, e@{"" if size.steady else ", &state->numbers[PRIVATE]"});
     } else if (status[0] < BETWEEN) {
         reset_noise(s, h);
     } else {
         /* between two updates */
     }
-@{after}
+@@ if size.watched and made.spec.sums
+    if (((number + 1u) % @{every}u) == 0u) {
+        top[0] = update_cusums(g, &s[AT_SUMS]);
+        end_evaluation(s, h, top);
+    }
+@@ elif size.watched
+    store_residual(s, h, status, e, w, when);
+    top[0] = update_cusums(g, w);
+    update_alarm(s, h, top, when);
+@@ endif
 }
 
-@{covariates}/* Count how long statistics have been above their limits; return the verdict. */
+@@ if made.covariates
+@@ include "covariates.c"
+@@ endif
+/* Count how long statistics have been above their limits; return the verdict. */
 static @{prefix}_verdict judge(@{prefix}_state *state, const @{prefix}_evaluation *q)
 {
-    const int ready = @{ready};
+    const int ready = @{"(q->updates > 0.0) && (q->place == " ~ upper ~ "_KNOWN)" if made.covariates else "q->updates > " ~ zero};
     const int exceeded = ready && ((q->statistic > LIMIT) || (q->level >= @{one}));
     @{prefix}_verdict verdict = @{upper}_WAITING;
 
@@ -109,8 +155,10 @@ static int sample(@{prefix}_state *state, @{number} r, @{number} u, @{number} y,
 {
     int due;
     int f;
-@{covariate_locals}
-    process(state, @{taken}, u, y, restart);
+@% if made.covariates %@    double average[@{upper}_COVARIATES];
+    const int known = follow_covariates(state, average);
+@% endif %@
+    process(state, @{"(known != 0) ? r : (double)NAN" if made.covariates else "r"}, u, y, restart);
     due = ((uint64_t)state->counters[SAMPLE] % @{upper}_EVERY) == 0u;
     if (due != 0) {
         evaluate(state->numbers, state->counters, q);
@@ -118,7 +166,10 @@ static int sample(@{prefix}_state *state, @{number} r, @{number} u, @{number} y,
             q->gamma[f].real = q->response[f].real - healthy[f].real;
             q->gamma[f].imag = q->response[f].imag - healthy[f].imag;
         }
-@{covariate_compare}        q->verdict = judge(state, q);
+@@ if made.covariates
+        compare_covariates(average, known, q);
+@@ endif
+        q->verdict = judge(state, q);
     }
     return due;
 }
@@ -133,7 +184,11 @@ void @{prefix}_init(@{prefix}_state *state)
     for (i = 0; i < @{upper}_NUMBERS; i++) {
         state->numbers[i] = @{zero};
     }
-@{initial}
+@@ for value in start.tolist()
+@@ if value
+    state->numbers[@{places.get(loop.index0, loop.index0)}] = @{value | c(single)};
+@@ endif
+@@ endfor
     state->exceeding = 0.0;
     state->since = OFF_DELAY + 1.0;
 }
@@ -165,7 +220,7 @@ size_t @{prefix}_block(@{prefix}_state *state, size_t count, const @{number} *r,
     return found;
 }
 
-@{frozen_functions}
+@@ include "frozen.c"
 /* CRC-32 of IEEE 802.3, bit by bit: a table would be a kilobyte of constants. */
 static uint32_t checksum(const unsigned char *bytes, size_t count)
 {

@@ -5,23 +5,23 @@
  * This file and @{prefix}.c are yours: use, change and pass them on as you like; no licence of servoscope applies.
  *
  * No memory is allocated, nothing is recursive, every loop is bounded, and all state is in one struct. Of the C library
- * fma, fabs, sqrt@{and_exp} and memcpy are called. A double has to be an IEEE 754 binary64; rounding is to nearest, subnormal
+ * fma, fabs, sqrt@{", exp" if made.covariates} and memcpy are called. A double has to be an IEEE 754 binary64; rounding is to nearest, subnormal
  * numbers are kept (no flush to zero), and no option such as -ffast-math may be given.
  */
-#ifndef @{guard}
-#define @{guard}
+#ifndef @{upper}_H
+#define @{upper}_H
 
 #include <stddef.h>
 #include <stdint.h>
 
-#define @{upper}_SAMPLE_RATE_HZ @{rate} /* of r, u and y */
+#define @{upper}_SAMPLE_RATE_HZ @{made.baseline.loop.sample_rate | c} /* of r, u and y */
 #define @{upper}_EVERY @{every}u /* samples per evaluation */
-#define @{upper}_COEFFICIENTS @{n}
-#define @{upper}_FREQUENCIES @{frequencies}
-#define @{upper}_STATE_NUMBERS @{size}u /* of the state of the monitor, as the program on the server keeps it */
+#define @{upper}_COEFFICIENTS @{size.n}
+#define @{upper}_FREQUENCIES @{size.frequencies}
+#define @{upper}_STATE_NUMBERS @{made.start | length}u /* of the state of the monitor, as the program on the server keeps it */
 #define @{upper}_COUNTERS @{header}u /* of them, at the head; the others follow */
 #define @{upper}_NUMBERS (@{upper}_STATE_NUMBERS - @{upper}_COUNTERS)
-#define @{upper}_ROW @{row} /* numbers at the head of an evaluation */
+#define @{upper}_ROW @{size.row} /* numbers at the head of an evaluation */
 #define @{upper}_CONSTANT_BYTES @{constant_bytes}
 #define @{upper}_IMAGE_BYTES @{image_bytes}u /* of a saved state */
 
@@ -38,7 +38,7 @@ typedef struct {
  * y to be expected to follow [@{y_unit}]; 0: a tenth of the range that y itself has covered.
  */
 #ifndef @{upper}_FROZEN_SAMPLES
-#define @{upper}_FROZEN_SAMPLES @{frozen}u
+#define @{upper}_FROZEN_SAMPLES @{limits.frozen}u
 #endif
 #ifndef @{upper}_FROZEN_TRAVEL
 #define @{upper}_FROZEN_TRAVEL 0.0
@@ -89,7 +89,10 @@ typedef struct {
     @{number} imag;
 } @{prefix}_residual;
 
-@{covariates_interface}/* One evaluation. */
+@@ if made.covariates
+@@ include "covariates_interface.c"
+@@ endif
+/* One evaluation. */
 typedef struct {
     @{number} updates;   /* samples that the estimate has taken so far */
     @{number} statistic; /* T^2; its limit is @{prefix}_limit */
@@ -100,7 +103,10 @@ typedef struct {
     @{prefix}_response response[@{upper}_FREQUENCIES];
     @{prefix}_residual gamma[@{upper}_FREQUENCIES];
     @{prefix}_verdict verdict;
-@{covariate_field}} @{prefix}_evaluation;
+@@ if made.covariates
+    @{prefix}_place place;
+@@ endif
+} @{prefix}_evaluation;
 
 /* The monitored frequencies, [Hz], and the limit of T^2. */
 extern const double @{prefix}_frequencies[@{upper}_FREQUENCIES];
@@ -109,7 +115,15 @@ extern const @{number} @{prefix}_limit;
 /* Make the state before the first sample. */
 void @{prefix}_init(@{prefix}_state *state);
 
-@{covariate_function}/* Say that the next sample does not follow the one before by one sample time. */
+@@ if made.covariates
+/*
+ * Say what the covariates are from the next sample on, in the units of the recordings; NaN is no new value of one.
+ * Call it before each sample, or as often as there are new values.
+ */
+void @{prefix}_covariates(@{prefix}_state *state, const double values[@{upper}_COVARIATES]);
+
+@@ endif
+/* Say that the next sample does not follow the one before by one sample time. */
 void @{prefix}_restart(@{prefix}_state *state);
 
 /*

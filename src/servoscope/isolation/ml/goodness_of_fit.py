@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray
-from servoscope.estimation.tuning import sum_covariance
+from servoscope.fit.tuning import sum_covariance
 from servoscope.isolation.ml.least_squares import normalise_columns, orthonormal_basis
 from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow
 

@@ -8,9 +8,8 @@ import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.records import ExactPredictorFit
-from servoscope.estimation.noise_model import LIKELIHOOD_DROP
 from servoscope.fit.plant_experiment import MAX_SAMPLES, PlantExperiment, initial_noise
-from servoscope.fit.search import fit
+from servoscope.fit.search import fit, raise_unknown
 from servoscope.isolation.ml.goodness_of_fit import misspecification_columns, score_test
 from servoscope.isolation.ml.window import ChangeProfile, RefitWindow
 from servoscope.signals import Recording
@@ -34,12 +33,7 @@ def fit_exact_predictor(baseline: Baseline, recordings: Sequence[Recording]) -> 
     if not np.isfinite(likely.cost) or recorded.is_silent(likely):
         return None
     # a minute hardly tells how loud n_u is: too much of it costs little, too little makes slow errors look certain
-    loudest, high = likely, MAX_LOUDER
-    for _ in range(BISECTIONS):
-        middle = recorded.search.at(np.append(0.5 * (loudest.x[0] + high), loudest.x[1:]), likely.free)
-        louder = middle.cost < likely.cost + 2.0 * LIKELIHOOD_DROP
-        loudest, high = (middle, high) if louder else (loudest, float(middle.x[0]))
-    noise = recorded.fitted_noise(loudest)
+    noise = recorded.fitted_noise(raise_unknown(likely, 0, MAX_LOUDER, BISECTIONS))
     explained = baseline.model_copy(update={"exact": ExactPredictorFit(noise=noise, misfit=0.0)})
     windows = (RefitWindow.from_recording(explained, rec, 0, min(rec.samples, MAX_SAMPLES)) for rec in recordings)
     return ExactPredictorFit(noise=noise, misfit=max(_misfit(window) for window in windows))

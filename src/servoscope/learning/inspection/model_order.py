@@ -12,7 +12,7 @@ from servoscope.estimation.filter_bank import FilterBank
 from servoscope.estimation.kernel.sample_steps import USED
 from servoscope.estimation.pipeline import Pipeline
 from servoscope.estimation.recursion import Recursion
-from servoscope.estimation.tuning import sandwich_covariance
+from servoscope.fit.tuning import sandwich_covariance
 from servoscope.learning.inspection.signals import InspectionModel
 from servoscope.models.loop import Loop, MonitorSettings
 from servoscope.models.plants import Column

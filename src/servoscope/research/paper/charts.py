@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from servoscope.report.plotting import COLOURS, plot_style
+from servoscope.report.plotting import COLOURS, WIDTH, create_panels, plot_style
 from servoscope.research.paper import tolerance, tradeoff, windup
 from servoscope.research.paper.conditions import FAULT_AT, OperatingConditions
-from servoscope.research.paper.figures import NAMES, WIDTH
+from servoscope.research.paper.figures import NAMES
 from servoscope.research.paper.quartiles import MetricQuartiles
 from servoscope.research.paper.table import pole_magnitudes
 
@@ -23,8 +23,7 @@ TITLES = {"": "last 10 s", ".motion": "in motion", ".rest": "at rest"}
 def draw_trade_off(metrics: Mapping[str, Sequence[float]]) -> Figure:
     """Draw CV over rise time, over the memory, for four estimators: whole period, in motion, at rest."""
     numbers = MetricQuartiles(metrics)
-    figure = Figure(figsize=(WIDTH, 4.8), layout="constrained")
-    axes = figure.subplots(2, 3, sharex=True, sharey="row")
+    figure, axes = create_panels(4.8, 2, 3, sharex=True, sharey="row")
     for row, (what, words) in zip(axes, (("cv_theta", "CV, parameters"), ("cv_H", "CV, iFRF at 1 Hz")), strict=True):
         for ax, (span, title) in zip(row, TITLES.items(), strict=True):
             for estimator in tradeoff.ESTIMATORS:
@@ -54,8 +53,7 @@ def draw_trade_off(metrics: Mapping[str, Sequence[float]]) -> Figure:
 def draw_conditions(metrics: Mapping[str, Sequence[float]]) -> Figure:
     """Draw each estimator's CV relative to the AKF's at equal rise time over operating conditions; below 1 it wins."""
     numbers = MetricQuartiles(metrics)
-    figure = Figure(figsize=(WIDTH, 3.6), layout="constrained")
-    axes = figure.subplots(1, 2, sharey=True)
+    figure, axes = create_panels(3.6, 1, 2, sharey=True)
     labels = [str(conditions) for conditions in tradeoff.CONDITIONS]
     places = np.arange(len(labels))[::-1]
     for ax, (what, words) in zip(axes, (("cv_theta", "parameters"), ("cv_H", "iFRF at 1 Hz")), strict=True):
@@ -73,8 +71,7 @@ def draw_conditions(metrics: Mapping[str, Sequence[float]]) -> Figure:
 @plot_style()
 def draw_windup(seed: int) -> Figure:
     """Draw how P grows over ten minutes at rest."""
-    figure = Figure(figsize=(WIDTH * 0.7, 3.0), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = create_panels(3.0, width=WIDTH * 0.7)
     for estimator in windup.ESTIMATORS:
         t, sizes = windup.covariance_at_rest(estimator, seed)
         style = {"color": COLOURS_OF[estimator], "linestyle": LINES_OF[estimator], "label": NAMES[estimator]}
@@ -89,8 +86,7 @@ def draw_windup(seed: int) -> Figure:
 def draw_poles() -> Figure:
     """Draw the magnitudes of all closed-loop poles with the healthy plant and with all of Table 2."""
     magnitudes_by_plant = pole_magnitudes()
-    figure = Figure(figsize=(WIDTH * 0.7, 3.6), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = create_panels(3.6, width=WIDTH * 0.7)
     places = np.arange(len(magnitudes_by_plant))[::-1]
     for place, magnitudes in zip(places, magnitudes_by_plant.values(), strict=True):
         ax.plot(magnitudes, np.full(len(magnitudes), place), "o", color=COLOURS["measured"], markersize=4.0, alpha=0.7)
@@ -103,8 +99,7 @@ def draw_poles() -> Figure:
 @plot_style()
 def draw_tolerance(seed: int) -> Figure:
     """Draw the rms tracking error of the last second, with and without rescheduled gains, for two faults."""
-    figure = Figure(figsize=(WIDTH, 4.4), layout="constrained")
-    axes = figure.subplots(len(tolerance.CASES), 1, sharex=True)
+    figure, axes = create_panels(4.4, len(tolerance.CASES), 1, sharex=True)
     second = np.ones(100) / 100.0
     for ax, case in zip(axes, tolerance.CASES, strict=True):
         told = tolerance.evaluate_rescheduling(case, seed)

@@ -8,8 +8,7 @@ from dataclasses import asdict, dataclass
 from importlib.resources import files
 from typing import Any, NamedTuple
 
-import numpy as np
-
+from servoscope.report.plain_values import replace_nan
 from servoscope.research.paper import tradeoff
 from servoscope.research.paper.conditions import TABLE_2
 from servoscope.research.paper.quartiles import MetricQuartiles, MetricSamples
@@ -32,10 +31,7 @@ class Claim:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON; a number that does not exist is None."""
-        plain = asdict(self)
-        plain["numbers"] = {
-            key: [value if np.isfinite(value) else None for value in values] for key, values in self.numbers.items()
-        }
+        plain: dict[str, Any] = replace_nan(asdict(self))
         return plain
 
 

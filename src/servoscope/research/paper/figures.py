@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from servoscope.estimation.filter_bank import nominal_theta
-from servoscope.report.plotting import COLOURS, plot_style, robust_range
+from servoscope.report.plotting import COLOURS, WIDTH, create_panels, plot_style, robust_range
 from servoscope.research.paper import sensitivity
 from servoscope.research.paper.conditions import (
     FAULT_AT,
@@ -26,7 +26,6 @@ from servoscope.research.paper.quartiles import MetricQuartiles
 from servoscope.research.paper.table import Table2Residuals
 from servoscope.research.paper.tracking import ifrf_targets, method_loop, tracking_traces
 
-WIDTH = 9.0
 INK, MUTED, RULE = COLOURS["ink"], COLOURS["muted"], COLOURS["rule"]
 FAULT_COLOURS = dict(zip(FAULT_NAMES.values(), ("#1f5fa8", "#c6501c", "#3b8c5a", "#8a5aa8"), strict=True))
 METHOD_COLOURS = {"dfrls": COLOURS["healthy"], "akf": COLOURS["measured"], "default": COLOURS["measured"]}
@@ -43,8 +42,7 @@ def _draw_zero_lines(ax: Axes) -> None:
 @plot_style()
 def figure_2() -> Figure:
     """Draw the sensitivities of G (upper) and H (lower) from 0.1 to 25 Hz; marks at 1, 10, 20 Hz."""
-    figure = Figure(figsize=(WIDTH, 4.8), layout="constrained")
-    axes = figure.subplots(2, 4)
+    figure, axes = create_panels(4.8, 2, 4)
     f = np.geomspace(0.1, 25.0, 400)
     rows = (("G", sensitivity.sensitivity_of_G), ("H", sensitivity.sensitivity_of_H))
     for row, (name, of) in zip(axes, rows, strict=True):
@@ -71,8 +69,7 @@ def figure_2() -> Figure:
 def figure_4(seed: int) -> Figure:
     """Draw reference and output of the healthy loop over 60 s."""
     recording = PAPER.simulate(rig_loop(), seed)
-    figure = Figure(figsize=(WIDTH, 2.6), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = create_panels(2.6)
     ax.plot(recording.t, 1e3 * recording.y, color=COLOURS["reference"], linewidth=2.2, label="output y")
     ax.plot(recording.t, 1e3 * recording.r, color=INK, linewidth=0.8, label="reference r")
     ax.set(xlabel="t [s]", ylabel="[mm]", xlim=(0.0, 60.0))
@@ -84,8 +81,8 @@ def figure_4(seed: int) -> Figure:
 def figure_5(seed: int, version: str) -> Figure:
     """Draw the coefficients over time on healthy data, started from zero, with their nominal values dashed."""
     methods = METHODS[version]
-    figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
-    axes = figure.subplots(2, 2, sharex=True).ravel()
+    figure, panels = create_panels(4.6, 2, 2, sharex=True)
+    axes = panels.ravel()
     nominal = nominal_theta(method_loop(methods[-1]))
     for i, ax in enumerate(axes):
         for method in methods:
@@ -135,8 +132,7 @@ def figure_6(seed: int, version: str) -> Figure:
 @plot_style()
 def figure_7(metrics: Table2Residuals) -> Figure:
     """Draw the residuals of Table 2 over the last 10 s: one row per frequency, one marker per size."""
-    figure = Figure(figsize=(WIDTH, 8.4), layout="constrained")
-    axes = figure.subplots(3, 2, width_ratios=[1, 1])
+    figure, axes = create_panels(8.4, 3, 2, width_ratios=[1, 1])
     pairs = (("pump", "leakage"), ("friction", "contamination"))
     for row, (i, f) in zip(axes, enumerate(FREQUENCIES), strict=True):
         healthy = metrics.healthy.between(50.0, 60.0).gamma[:, i]
@@ -169,8 +165,7 @@ def figure_8(metrics: Mapping[str, Sequence[float]], version: str) -> Figure:
     """Draw coefficients of variation, parameters against iFRF, with quartiles where there are several seeds."""
     methods = METHODS[version]
     numbers = MetricQuartiles(metrics)
-    figure = Figure(figsize=(WIDTH * 0.7, 3.2), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = create_panels(3.2, width=WIDTH * 0.7)
     columns = ["cv_theta", *(f"cv_H.{f:g}" for f in FREQUENCIES)]
     for j, method in enumerate(methods):
         keys = [f"{method}.{column}" for column in columns]

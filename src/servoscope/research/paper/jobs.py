@@ -5,13 +5,15 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from servoscope.research.paper import sensitivity, table, tolerance, tracking, tradeoff, windup
 from servoscope.research.paper.conditions import FREQUENCIES, rig_plant
 
-PARTS: Mapping[str, Callable[[int], dict[str, float]]] = {
+PARTS: Mapping[str, Callable[[int], dict[str, float]]] = {  # the long ones first
+    **{str(conditions): partial(tradeoff.trade_off_metrics, conditions) for conditions in tradeoff.CONDITIONS},
     "diagnosis": table.evaluate_default_method,
     "table": table.evaluate_paper_method,
     "windup": windup.windup_metrics,
@@ -31,27 +33,14 @@ class SeedJob:
 
 def list_jobs(seeds: Sequence[int]) -> list[SeedJob]:
     """Return all jobs, the long ones first so that no process is left alone with one at the end."""
-    parts = [*map(str, tradeoff.CONDITIONS), *PARTS]
-    return [*(SeedJob(part, seed) for part in parts for seed in seeds), SeedJob(NOISE_FREE_PART, seeds[0])]
+    return [*(SeedJob(part, seed) for part in PARTS for seed in seeds), SeedJob(NOISE_FREE_PART, seeds[0])]
 
 
 def run_job(job: SeedJob) -> dict[str, float]:
     """Do one job; return what it measured."""
     if job.part == NOISE_FREE_PART:
         return noise_free_metrics()
-    if job.part in PARTS:
-        return PARTS[job.part](job.seed)
-    conditions = next(conditions for conditions in tradeoff.CONDITIONS if str(conditions) == job.part)
-    flat = tradeoff.trade_off_metrics(conditions, job.seed)
-    for other in tradeoff.ESTIMATORS[1:]:
-        for column in tradeoff.COLUMNS[1:]:
-            flat[f"equal_rise.{column}.{other}|{conditions}"] = tradeoff.cv_ratio(
-                flat, conditions, column, "akf", other
-            )
-    if conditions == tradeoff.CONDITIONS[0]:
-        at_base = {key: value for key, value in flat.items() if key.startswith("equal_rise.")}
-        flat |= {key.split("|")[0]: value for key, value in at_base.items()}
-    return flat
+    return PARTS[job.part](job.seed)
 
 
 def noise_free_metrics() -> dict[str, float]:

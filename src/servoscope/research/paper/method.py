@@ -12,7 +12,7 @@ from servoscope.core.arrays import ComplexArray, FloatArray
 from servoscope.estimation import two_stage
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.pipeline import Pipeline, Tuning
-from servoscope.estimation.tuning import fit_tuning
+from servoscope.fit.tuning import fit_tuning
 from servoscope.models.loop import Loop
 from servoscope.research.paper.conditions import FREQUENCIES, SIZES, TABLE_2
 from servoscope.signals import Recording

@@ -55,9 +55,6 @@ def run_reproduction(seeds: Sequence[int], told: StepCallback = lambda _: None) 
 
 def run_jobs(work: Sequence[SeedJob], processes: int) -> Iterator[tuple[SeedJob, dict[str, float]]]:
     """Yield each job with what it measured, as they are done, on so many processes."""
-    if processes <= 1:
-        yield from ((job, jobs.run_job(job)) for job in work)
-        return
     pool = Workers(environment={**os.environ, **dict.fromkeys(ONE_THREAD, "1")})
     for job, outcome in pool.map(f"{__name__}:run_in_worker", work, processes):
         if isinstance(outcome, WorkerError):

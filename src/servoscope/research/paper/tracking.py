@@ -74,10 +74,9 @@ def tracking_metrics(seed: int) -> dict[str, float]:
         for i, f in enumerate(FREQUENCIES):
             values[f"{method}.cv_H.{f:g}"] = metrics.cv_H(late.H[:, i])
             values[f"{method}.bias.{f:g}"] = float(np.abs(late.gamma[:, i].mean()) / np.abs(nominal[i]))
-        error = late.gamma[:, 0].mean() / np.abs(nominal[0])
-        values[f"{method}.bias_real"], values[f"{method}.bias_imag"] = float(error.real), float(error.imag)
-        relative = (late.gamma[:, 0].mean().real / nominal[0].real, late.gamma[:, 0].mean().imag / nominal[0].imag)
-        values[f"{method}.own_bias_real"], values[f"{method}.own_bias_imag"] = (float(x) for x in relative)
+        bias = complex(late.gamma[:, 0].mean())
+        values[f"{method}.own_bias_real"] = float(bias.real / nominal[0].real)
+        values[f"{method}.own_bias_imag"] = float(bias.imag / nominal[0].imag)
         level = complex(before.H[:, 0].mean())
         for share in (0.5, 0.9):
             # the bias scales with H: measured from the level that it has reached, by the ratio that is true

@@ -48,31 +48,27 @@ def trade_off_curve(
 
 
 def trade_off_metrics(conditions: OperatingConditions, seed: int) -> dict[str, float]:
-    """Return all curves of one operating condition as flat numbers, ``condition|estimator|column|memory``."""
-    flat: dict[str, float] = {}
-    memories = MEMORIES if conditions == OperatingConditions() else MEMORIES_BESIDE_NOMINAL
-    for estimator in ESTIMATORS:
-        for column, values in trade_off_curve(estimator, conditions, seed, memories).items():
-            for memory, value in zip(memories, values, strict=True):
-                flat[f"{conditions}|{estimator}|{column}|{memory:g}"] = value
+    """Return all curves of one operating condition as flat numbers, ``condition|estimator|column|memory``.
+
+    CVs of the AKF over those of another estimator at equal rise time are ``equal_rise.column.estimator|condition``, and
+    without the condition where it is the nominal one; below 1 the AKF is the quieter.
+    """
+    is_nominal = conditions == OperatingConditions()
+    memories = MEMORIES if is_nominal else MEMORIES_BESIDE_NOMINAL
+    curves = {estimator: trade_off_curve(estimator, conditions, seed, memories) for estimator in ESTIMATORS}
+    flat = {
+        f"{conditions}|{estimator}|{column}|{memory:g}": value
+        for estimator, curve in curves.items()
+        for column, values in curve.items()
+        for memory, value in zip(memories, values, strict=True)
+    }
+    akf, places = curves["akf"], (f"|{conditions}", "") if is_nominal else (f"|{conditions}",)
+    for estimator in ESTIMATORS[1:]:
+        curve = curves[estimator]
+        for column in COLUMNS[1:]:
+            ratio = metrics.ratio_at_equal_rise(akf["rise"], akf[column], curve["rise"], curve[column])
+            flat |= {f"equal_rise.{column}.{estimator}{place}": ratio for place in places}
     return flat
-
-
-def curve_column(flat: dict[str, float], conditions: OperatingConditions, estimator: str, name: str) -> list[float]:
-    """Return one column of `trade_off_metrics`, by memory."""
-    memories = MEMORIES if conditions == OperatingConditions() else MEMORIES_BESIDE_NOMINAL
-    return [flat[f"{conditions}|{estimator}|{name}|{memory:g}"] for memory in memories]
-
-
-def cv_ratio(
-    flat: dict[str, float], conditions: OperatingConditions, name: str, first: str = "akf", other: str = "dfrls"
-) -> float:
-    """Return CV of one estimator over that of another at equal rise time; below 1 the first is the quieter."""
-    pairs = [
-        (curve_column(flat, conditions, curve, "rise"), curve_column(flat, conditions, curve, name))
-        for curve in (first, other)
-    ]
-    return metrics.ratio_at_equal_rise(*pairs[0], *pairs[1])
 
 
 def ifrf_rise_time(generator: ResidualGenerator, faulty: ResidualTrace) -> float:

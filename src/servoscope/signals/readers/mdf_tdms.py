@@ -22,19 +22,14 @@ DEFAULT_TIME_NAME = "time"  # of a raster whose clock has no name
 
 @dataclass(frozen=True, eq=False)
 class _Raster:
-    """Channels that were sampled together: number of rows, where each channel is in the file, and its unit."""
+    """Channels that were sampled together: number of rows, and where each channel is in the file.
+
+    `labels`: names with their units behind them, by which the places are known, by the names in the file.
+    """
 
     rows: int
     places: Mapping[str, Any]
-    units: Mapping[str, str]
-
-    def named(self) -> _Raster:
-        """Return it with the units behind the names."""
-        return _Raster(self.rows, {self.label(name): place for name, place in self.places.items()}, self.units)
-
-    def label(self, name: str) -> str:
-        """Return a channel's name with its unit."""
-        return with_unit(name, self.units.get(name, ""))
+    labels: Mapping[str, str]
 
 
 # takes file, raster, names, first row, number of rows
@@ -54,15 +49,16 @@ def open_mdf(path: Path) -> TableFile:
         rasters = []
         for g, group in enumerate(file.groups):
             master = file.masters_db.get(g)
-            names: dict[str, Any] = {}
-            units: dict[str, str] = {}
+            places: dict[str, Any] = {}
+            labels: dict[str, str] = {}
             for i, channel in enumerate(group.channels):
                 name = (channel.name or DEFAULT_TIME_NAME) if i == master else channel.name
-                names.setdefault(name, (None, g, i))
-                units.setdefault(name, str(file.get_channel_unit(group=g, index=i) or "").strip())
+                if name not in labels:
+                    labels[name] = with_unit(name, str(file.get_channel_unit(group=g, index=i) or "").strip())
+                    places[labels[name]] = None, g, i
             if group.channel_group.cycles_nr > MAX_RATIO * path.stat().st_size:  # the library would read for ever
                 raise ValueError("names more rows than it can hold")
-            rasters.append(_Raster(int(group.channel_group.cycles_nr), names, units))
+            rasters.append(_Raster(int(group.channel_group.cycles_nr), places, labels))
         return rasters
 
     def read(file: Any, raster: _Raster, names: Sequence[str], first: int, rows: int) -> Mapping[str, Any]:
@@ -97,17 +93,17 @@ def open_tdms(path: Path) -> TableFile:
         channels = [channel for group in file.groups() for channel in group.channels()]
         names = [channel.name for channel in channels]
         rasters: dict[tuple[Any, ...], dict[str, Any]] = {}
-        units: dict[str, str] = {}
+        labels: dict[str, str] = {}
         for channel in channels:
             step = float(channel.properties.get("wf_increment", 0.0))
             begin = float(channel.properties.get("wf_start_offset", 0.0))
             name = channel.name if names.count(channel.name) == 1 else f"{channel.group_name}/{channel.name}"
-            rasters.setdefault((len(channel), step, begin), {})[name] = (channel.group_name, channel.name)
-            units[name] = str(channel.properties.get("unit_string", "")).strip()
+            labels[name] = with_unit(name, str(channel.properties.get("unit_string", "")).strip())
+            rasters.setdefault((len(channel), step, begin), {})[labels[name]] = (channel.group_name, channel.name)
         for (_, step, begin), places in rasters.items():
             if step > 0.0:
                 places.setdefault(DEFAULT_TIME_NAME, (step, begin))
-        return [_Raster(rows, places, units) for (rows, *_), places in rasters.items()]
+        return [_Raster(rows, places, labels) for (rows, *_), places in rasters.items()]
 
     def read(file: Any, raster: _Raster, names: Sequence[str], first: int, rows: int) -> Mapping[str, Any]:
         values: dict[str, Any] = {}
@@ -177,10 +173,14 @@ def _open_measurement(
                 yield Table(path.name, columns, first + 1)
 
     with one_line_errors(*damaged), opened() as file:
-        nonempty = [raster for raster in list_rasters(file) if raster.rows]
-    rasters = [raster.named() for raster in nonempty]
+        rasters = [raster for raster in list_rasters(file) if raster.rows]
     names = dict.fromkeys(name for raster in rasters for name in raster.places)
-    aliases = {name: raster.label(name) for raster in nonempty for name in raster.places if raster.label(name) != name}
+    aliases = {
+        name: label
+        for raster in rasters
+        for name, label in raster.labels.items()
+        if label != name and label in raster.places
+    }
     if not names:
         raise RecordingError(f"{path}: holds no channels with values")
     groups = tuple(tuple(raster.places) for raster in rasters)

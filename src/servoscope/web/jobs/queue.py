@@ -16,7 +16,7 @@ from typing import Any
 from starlette.exceptions import HTTPException
 
 from servoscope.core.errors import ServoscopeError
-from servoscope.core.messages import SETTING, current_language, message, render
+from servoscope.core.messages import SETTING, current_language, say
 from servoscope.core.sandbox import Sandbox
 from servoscope.core.workers import ProcessLimits, Progress, Workers
 from servoscope.web import errors
@@ -48,12 +48,8 @@ class Job:
     out: Path | None  # the folder into which it writes
     finish: Callable[[Any], JsonObject]  # turns the task's result into the job's, in a thread
     discard: Callable[[], None] = lambda: None  # removes what a failed job leaves
-    ended: asyncio.Event = field(default_factory=asyncio.Event)
-    handle: asyncio.Task[None] | None = None
     response: JobResponse = field(init=False)  # what users see of it
-
-    def __post_init__(self) -> None:
-        self.response = JobResponse(id=secrets.token_hex(8), kind=self.kind, created=time.time())
+    handle: asyncio.Task[None] = field(init=False)
 
 
 class JobQueue:
@@ -73,6 +69,7 @@ class JobQueue:
             raise HTTPException(429, "too many jobs wait, try again later", headers={"Retry-After": "10"})
         for old in [job for job in self._jobs.values() if job.response.finished is not None][: -MAX_FINISHED or None]:
             del self._jobs[old.response.id]
+        job.response = JobResponse(id=secrets.token_hex(8), kind=job.kind, created=time.time())
         self._jobs[job.response.id] = job
         job.handle = asyncio.create_task(self._run(job))
         return job.response
@@ -83,16 +80,9 @@ class JobQueue:
             raise HTTPException(404, f"there is no job {id_}")
         return self._jobs[id_]
 
-    def cancel(self, job: Job) -> None:
-        """Stop a job."""
-        if job.handle is not None and job.response.finished is None:
-            job.handle.cancel()
-
     async def close(self) -> None:
         """Stop all jobs."""
-        handles = [
-            job.handle for job in self._jobs.values() if job.handle is not None and job.response.finished is None
-        ]
+        handles = [job.handle for job in self._jobs.values()]
         for handle in handles:
             handle.cancel()
         await asyncio.gather(*handles, return_exceptions=True)
@@ -124,16 +114,15 @@ class JobQueue:
         except HTTPException as error:
             shown.problem = errors.problem(error.status_code, str(error.detail))
         except asyncio.CancelledError:
-            shown.problem = errors.problem(409, render(message("web.job_stopped")))
+            shown.problem = errors.problem(409, say("web.job_stopped"))
         except Exception:
-            shown.problem = errors.problem(500, render(message("web.job_failed")))
+            shown.problem = errors.problem(500, say("web.job_failed"))
             raise
         finally:
             if shown.problem is not None:
                 shown.state = "failed"
                 await asyncio.to_thread(job.discard)
             shown.finished, shown.step = time.time(), None
-            job.ended.set()
 
 
 async def run_task(

@@ -6,8 +6,7 @@ import asyncio
 import time
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Response
-from starlette.exceptions import HTTPException
+from fastapi import APIRouter, HTTPException, Query, Response
 
 from servoscope.service.alarms import FAULT_ALARM, alarm_kind
 from servoscope.service.assets.status import AssetStatus, ServiceStatus
@@ -15,9 +14,8 @@ from servoscope.service.store.queries import query_history
 from servoscope.web.checks import asset_checks, last_full_diagnosis
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
 from servoscope.web.schemas import assets as schemas
-from servoscope.web.schemas.checks import FaultCheck
 from servoscope.web.schemas.requests import AssetQuery, AuditQuery, CommandName, CommandRequest, TransitionQuery
-from servoscope.web.schemas.responses import AuditEntry, AuditList, DiagnosisRow
+from servoscope.web.schemas.responses import AuditEntry, AuditList, DiagnosisRow, FaultCheck
 from servoscope.web.statuses import read_statuses, service_statuses
 from servoscope.web.stored_diagnosis import stored_headline
 

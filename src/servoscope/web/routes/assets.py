@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from fastapi import APIRouter, Query, Request, Response
-from starlette.exceptions import HTTPException
+from fastapi import APIRouter, HTTPException, Query, Request, Response
 
 from servoscope.core.errors import BaselineError, LoopError, StoreError, StoreUnavailableError
 from servoscope.design.operating_limits import OperatingLimit, operating_limits
@@ -27,9 +26,9 @@ from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
 from servoscope.web.downsample import signal_columns
 from servoscope.web.routes.baselines import asset_baseline_id, find_baseline, load_cached, load_loop_baseline
 from servoscope.web.schemas import assets as schemas
-from servoscope.web.schemas import sizes
-from servoscope.web.schemas.checks import CheckRequest, FaultCheck
+from servoscope.web.schemas import responses
 from servoscope.web.schemas.requests import (
+    CheckRequest,
     FleetQuery,
     HistoryQuery,
     NoteRequest,
@@ -135,30 +134,30 @@ def get_residuals(context: ContextDep, asset: str, query: Annotated[HistoryQuery
 
 
 @router.get("/assets/{asset}/sizes")
-def get_sizes(context: ContextDep, asset: str, query: Annotated[SizeQuery, Query()]) -> sizes.SizeHistory:
+def get_sizes(context: ContextDep, asset: str, query: Annotated[SizeQuery, Query()]) -> responses.SizeHistory:
     """Return how its faults, or its coefficients, have changed over a time."""
     find_asset(context, asset)
     kinds = FAULT_KINDS if query.of == "faults" else ("coefficient",)
     series = read_series(context.store, asset, query.span, kinds) if context.store.has_sizes else {}
     columns = ("t", "value", "low", "high", "healthy")
     curves = [
-        sizes.SizeCurve.model_validate(
+        responses.SizeCurve.model_validate(
             {"kind": kind, "name": name, **dict(zip(columns, thin_columns(rows, query.points).tolist(), strict=True))}
         )
         for (kind, name), rows in series.items()
     ]
-    return sizes.SizeHistory(asset=asset, curves=curves)
+    return responses.SizeHistory(asset=asset, curves=curves)
 
 
 @router.get("/assets/{asset}/notes")
-def list_notes(context: ContextDep, asset: str) -> sizes.NoteList:
+def list_notes(context: ContextDep, asset: str) -> responses.NoteList:
     """List what people have noted about it."""
     find_asset(context, asset)
-    return sizes.NoteList(notes=[sizes.Note.model_validate(note) for note in read_notes(context.store, asset)])
+    return responses.NoteList(notes=[responses.Note.model_validate(note) for note in read_notes(context.store, asset)])
 
 
 @router.post("/assets/{asset}/notes", status_code=201)
-def add_note(context: ContextDep, who: Operator, asset: str, request: NoteRequest) -> sizes.Note:
+def add_note(context: ContextDep, who: Operator, asset: str, request: NoteRequest) -> responses.Note:
     """Note what was done to it."""
     _, status = find_asset(context, asset)
     if request.kind != NOTE and status.metadata.plant == "arm":
@@ -166,11 +165,11 @@ def add_note(context: ContextDep, who: Operator, asset: str, request: NoteReques
             409, f"{asset}: an arm learns from logs, and not from what the store keeps: use servoscope learn"
         )
     context.store.add_audit(who.user, asset, NOTE, request.model_dump())
-    return sizes.Note(who=who.user, **request.model_dump())
+    return responses.Note(who=who.user, **request.model_dump())
 
 
 @router.post("/assets/{asset}/checks")
-def write_checks(context: ContextDep, who: Operator, asset: str, request: CheckRequest) -> list[FaultCheck]:
+def write_checks(context: ContextDep, who: Operator, asset: str, request: CheckRequest) -> list[responses.FaultCheck]:
     """Write what to check on it for a fault, in words of one's own; the audit keeps who did, and what was there."""
     find_asset(context, asset)
     context.store.add_audit(who.user, asset, CHECKS, request.model_dump())
@@ -178,7 +177,7 @@ def write_checks(context: ContextDep, who: Operator, asset: str, request: CheckR
 
 
 @router.get("/assets/{asset}/trend")
-def get_trend(context: ContextDep, asset: str, query: Annotated[TrendQuery, Query()]) -> sizes.Forecast:
+def get_trend(context: ContextDep, asset: str, query: Annotated[TrendQuery, Query()]) -> responses.Forecast:
     """Return how a size grows, and when it will reach a limit; 404 where there is no such size."""
     find_asset(context, asset)
     try:
@@ -188,18 +187,18 @@ def get_trend(context: ContextDep, asset: str, query: Annotated[TrendQuery, Quer
     except StoreError as error:
         raise HTTPException(404, str(error)) from None
     prognosis = prognose(series, query.limit)
-    return sizes.Forecast(asset=asset, **dict(prognosis))
+    return responses.Forecast(asset=asset, **dict(prognosis))
 
 
 @router.get("/assets/{asset}/limits")
-def get_limits(context: ContextDep, asset: str) -> sizes.LimitList:
+def get_limits(context: ContextDep, asset: str) -> responses.LimitList:
     """Return the sizes at which its loop loses tracking or its margin of stability; none where that is not known."""
     find_asset(context, asset)
     id_ = asset_baseline_id(context, asset)
     if id_ is None:
-        return sizes.LimitList(limits=[])
+        return responses.LimitList(limits=[])
     path = find_baseline(context, id_).path
-    return sizes.LimitList(limits=list(_loop_limits(path, load_cached(path).hash)))
+    return responses.LimitList(limits=list(_loop_limits(path, load_cached(path).hash)))
 
 
 @functools.lru_cache(maxsize=256)  # it takes a second, and every reader of a page asks

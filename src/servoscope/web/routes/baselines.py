@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import shutil
-import tomllib
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from fastapi import APIRouter
+from fastapi import APIRouter, HTTPException, Response
 from fastapi.responses import FileResponse
-from starlette.exceptions import HTTPException
-from starlette.responses import Response
-from starlette.status import HTTP_201_CREATED, HTTP_202_ACCEPTED, HTTP_204_NO_CONTENT
 
 from servoscope.baseline.arm import AnyBaseline, ArmBaseline, load_baseline
 from servoscope.baseline.baseline import Baseline
@@ -157,7 +153,7 @@ def download_baseline(context: ContextDep, id: str) -> Response:
     return FileResponse(baseline.path, media_type="application/json", filename=name)
 
 
-@router.delete("/baselines/{id}", status_code=HTTP_204_NO_CONTENT)
+@router.delete("/baselines/{id}", status_code=204)
 def delete_baseline(context: ContextDep, who: Engineer, id: str) -> None:
     """Delete a baseline that was saved here."""
     if id.startswith(SERVICE_PREFIX):
@@ -173,7 +169,7 @@ def list_loops(context: ContextDep) -> responses.LoopList:
     rows = []
     for name in EXAMPLES:
         text = files("servoscope.simulation").joinpath(f"{name}.toml").read_text(encoding="utf-8")
-        rows.append(_loop_row({"example": name}, Loop.from_dict(tomllib.loads(text)), text))
+        rows.append(_loop_row({"example": name}, Loop.from_text(text, f"{name}.toml"), text))
     loops = ((file.row.id, load_cached(file.path).loop) for file in _list_files(context))
     rows += [_loop_row({"baseline": id_}, loop, None) for id_, loop in loops if isinstance(loop, Loop)]
     return responses.LoopList(loops=rows)
@@ -192,7 +188,7 @@ def _loop_row(ref: dict[str, str], loop: Loop, toml: str | None) -> responses.Lo
     )
 
 
-@router.post("/learnings", status_code=HTTP_202_ACCEPTED)
+@router.post("/learnings", status_code=202)
 async def start_learning(context: ContextDep, who: Engineer, request: LearningRequest) -> responses.JobResponse:
     """Learn from healthy uploads, and inspect each of them; a job. Its baseline waits to be saved."""
     uploads = [recording.upload for recording in request.recordings]
@@ -216,7 +212,7 @@ async def start_learning(context: ContextDep, who: Engineer, request: LearningRe
     return context.jobs.submit(Job("learning", who.user, "learn_baseline", arguments, out, reads, out, finish, discard))
 
 
-@router.post("/baselines", status_code=HTTP_201_CREATED)
+@router.post("/baselines", status_code=201)
 def save_baseline(context: ContextDep, who: Engineer, request: BaselineRequest) -> responses.BaselineRow:
     """Save a learned baseline under a name."""
     learned = context.storage.path(responses.LearningRow, request.learning) / "baseline.json"

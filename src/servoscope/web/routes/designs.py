@@ -6,9 +6,7 @@ import asyncio
 import json
 from functools import partial
 
-from fastapi import APIRouter
-from starlette.responses import Response
-from starlette.status import HTTP_202_ACCEPTED
+from fastapi import APIRouter, Response
 
 from servoscope.web.dependencies import VIEWER, ContextDep, Engineer
 from servoscope.web.jobs.queue import Job
@@ -40,7 +38,7 @@ def get_design_report(context: ContextDep, id: str) -> Response:
     return report_response(context, DesignRow, id)
 
 
-@router.post("/designs", status_code=HTTP_202_ACCEPTED)
+@router.post("/designs", status_code=202)
 async def start_design(context: ContextDep, who: Engineer, request: DesignRequest) -> JobResponse:
     """Study which faults can be detected and isolated; a job."""
     paths = await asyncio.to_thread(context.storage.upload_paths, request.recordings)

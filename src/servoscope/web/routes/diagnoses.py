@@ -8,11 +8,8 @@ from functools import partial
 from typing import Annotated, Any
 
 import sqlalchemy as sa
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, HTTPException, Query, Response
 from fastapi.responses import FileResponse
-from starlette.exceptions import HTTPException
-from starlette.responses import Response
-from starlette.status import HTTP_202_ACCEPTED
 
 from servoscope.diagnosis.checks import suspects
 from servoscope.diagnosis.result import Diagnosis
@@ -179,7 +176,7 @@ def report_response(context: Context, model: type[responses.StorageRecord], id_:
     return FileResponse(path, media_type="text/html", headers={"Content-Security-Policy": REPORT_POLICY})
 
 
-@router.post("/diagnoses", status_code=HTTP_202_ACCEPTED)
+@router.post("/diagnoses", status_code=202)
 async def start_diagnosis(context: ContextDep, who: Operator, request: DiagnosisRequest) -> responses.JobResponse:
     """Diagnose an upload with a baseline; a job."""
     file = await asyncio.to_thread(context.storage.upload, request.upload)

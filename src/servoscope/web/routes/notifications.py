@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter
-from starlette.exceptions import HTTPException
-from starlette.status import HTTP_202_ACCEPTED
+from fastapi import APIRouter, HTTPException
 
 from servoscope.core.addresses import show_address
 from servoscope.service.actions.settings import (
@@ -18,7 +16,7 @@ from servoscope.service.actions.settings import (
 from servoscope.service.store.queries import query_history
 from servoscope.service.store.rows import TEST
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Engineer
-from servoscope.web.schemas.notifications import NotificationOutlet, NotificationOutlets
+from servoscope.web.schemas.responses import NotificationOutlet, NotificationOutlets
 
 router = APIRouter(tags=["alarms"], dependencies=[VIEWER])
 
@@ -65,7 +63,7 @@ def list_outlets(context: ContextDep) -> NotificationOutlets:
     return NotificationOutlets(outlets=list(_outlets(context).values()))
 
 
-@router.post("/notifications/{name}/test", status_code=HTTP_202_ACCEPTED)
+@router.post("/notifications/{name}/test", status_code=202)
 def test_outlet(context: ContextDep, who: Engineer, name: str) -> NotificationOutlet:
     """Ask the service to send a test; `last` is its delivery once there is one."""
     outlet, config = _outlets(context).get(name), context.config

@@ -9,8 +9,7 @@ from hmac import compare_digest
 from typing import Annotated, Any
 from urllib.parse import urlencode
 
-from fastapi import APIRouter, Query, Request
-from starlette.exceptions import HTTPException
+from fastapi import APIRouter, HTTPException, Query, Request
 from starlette.responses import RedirectResponse
 
 from servoscope.service.access.oidc import CALLBACK, OidcSettings

@@ -5,9 +5,7 @@ from __future__ import annotations
 import asyncio
 from functools import partial
 
-from fastapi import APIRouter
-from starlette.exceptions import HTTPException
-from starlette.status import HTTP_202_ACCEPTED
+from fastapi import APIRouter, HTTPException
 
 from servoscope.baseline.arm import ArmBaseline
 from servoscope.baseline.baseline import Baseline
@@ -51,7 +49,7 @@ def get_progress(context: ContextDep, asset: str) -> responses.RelearningState |
     return _progress(context, config, asset, status)
 
 
-@router.post("/assets/{asset}/relearnings", status_code=HTTP_202_ACCEPTED)
+@router.post("/assets/{asset}/relearnings", status_code=202)
 async def start_preview(
     context: ContextDep, who: Engineer, asset: str, request: RelearningRequest
 ) -> responses.JobResponse:

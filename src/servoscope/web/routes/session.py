@@ -5,10 +5,8 @@ from __future__ import annotations
 import asyncio
 import time
 
-from fastapi import APIRouter, Request, Response
-from starlette.exceptions import HTTPException
+from fastapi import APIRouter, HTTPException, Request, Response
 from starlette.requests import ClientDisconnect
-from starlette.status import HTTP_204_NO_CONTENT
 
 from servoscope import __version__
 from servoscope.web.dependencies import Context, ContextDep, OptionalPrincipal, Principal
@@ -76,7 +74,7 @@ def set_session_cookie(context: Context, response: Response, secret: str) -> Non
     )
 
 
-@router.delete("/session", status_code=HTTP_204_NO_CONTENT)
+@router.delete("/session", status_code=204)
 async def log_out(context: ContextDep, who: OptionalPrincipal, response: Response) -> None:
     """Log out."""
     if who is not None and who.session_secret is not None:

@@ -8,9 +8,7 @@ import re
 from pathlib import Path
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request
-from starlette.exceptions import HTTPException
-from starlette.status import HTTP_201_CREATED, HTTP_202_ACCEPTED, HTTP_204_NO_CONTENT
+from fastapi import APIRouter, HTTPException, Query, Request
 
 from servoscope.signals.readers import readable_suffixes
 from servoscope.web.dependencies import VIEWER, ContextDep, Operator
@@ -26,7 +24,7 @@ STORAGE_FACTOR = 10.0  # times the largest upload that all uploads together may 
 REQUEST_BODY = {"required": True, "content": {UPLOAD_TYPE: {"schema": {"type": "string", "format": "binary"}}}}
 
 
-@router.post("/uploads", status_code=HTTP_201_CREATED, openapi_extra={"requestBody": REQUEST_BODY})
+@router.post("/uploads", status_code=201, openapi_extra={"requestBody": REQUEST_BODY})
 async def create_upload(
     context: ContextDep, who: Operator, request: Request, query: Annotated[UploadQuery, Query()]
 ) -> UploadDetail:
@@ -86,7 +84,7 @@ def get_upload(context: ContextDep, id: str) -> UploadDetail:
     return context.uploads.read(id)
 
 
-@router.delete("/uploads/{id}", status_code=HTTP_204_NO_CONTENT)
+@router.delete("/uploads/{id}", status_code=204)
 def delete_upload(context: ContextDep, who: Operator, id: str) -> None:
     """Delete an upload; diagnoses of it stay."""
     record = context.storage.read(UploadRow, id)
@@ -94,7 +92,7 @@ def delete_upload(context: ContextDep, who: Operator, id: str) -> None:
     context.storage.remove("uploads", id)
 
 
-@router.post("/inspections", status_code=HTTP_202_ACCEPTED)
+@router.post("/inspections", status_code=202)
 async def start_inspection(context: ContextDep, who: Operator, request: InspectionRequest) -> JobResponse:
     """Find out whether an upload is usable, and if not, why; a job."""
     file = await asyncio.to_thread(context.storage.upload, request.upload)
@@ -105,7 +103,7 @@ async def start_inspection(context: ContextDep, who: Operator, request: Inspecti
     )
 
 
-@router.post("/assessments", status_code=HTTP_202_ACCEPTED)
+@router.post("/assessments", status_code=202)
 async def start_assessment(context: ContextDep, who: Operator, request: InspectionRequest) -> JobResponse:
     """Find out what is most likely wrong with a loop, from one log without a baseline; a job."""
     file = await asyncio.to_thread(context.storage.upload, request.upload)
@@ -114,7 +112,7 @@ async def start_assessment(context: ContextDep, who: Operator, request: Inspecti
     )
 
 
-@router.post("/proposals", status_code=HTTP_202_ACCEPTED)
+@router.post("/proposals", status_code=202)
 async def start_proposal(context: ContextDep, who: Operator, request: ProposalRequest) -> JobResponse:
     """Propose a loop file for an upload, with the evidence for each line, and inspect the upload with it; a job."""
     file = await asyncio.to_thread(context.storage.upload, request.upload)
@@ -127,18 +125,15 @@ async def start_proposal(context: ContextDep, who: Operator, request: ProposalRe
 async def get_job(context: ContextDep, id: str, query: Annotated[JobQuery, Query()]) -> JobResponse:
     """Return how far a job is; with `wait`, as soon as it has ended."""
     job = context.jobs.find(id)
-    if query.wait and job.response.finished is None:
-        try:
-            await asyncio.wait_for(job.ended.wait(), query.wait)
-        except TimeoutError:
-            return job.response
+    if query.wait:
+        await asyncio.wait([job.handle], timeout=query.wait)
     return job.response
 
 
-@router.delete("/jobs/{id}", status_code=HTTP_204_NO_CONTENT)
+@router.delete("/jobs/{id}", status_code=204)
 async def cancel_job(context: ContextDep, who: Operator, id: str) -> None:
     """Stop one's own job, or any with the role engineer."""
     job = context.jobs.find(id)
     if job.user != who.user and who.role != "engineer":
         raise HTTPException(403, f"it is {job.user}'s")
-    context.jobs.cancel(job)
+    job.handle.cancel()

@@ -19,9 +19,15 @@ from servoscope.service.alarms.records import UNACKNOWLEDGED_STATES
 from servoscope.service.assets.outlook import Outlook
 from servoscope.service.assets.status import AlarmStatus, AssetStatus, AssetVerdict, FloodCounts, ServiceStatus
 from servoscope.web.asset_document import asset_document, status_headline
-from servoscope.web.schemas.checks import FaultCheck
 from servoscope.web.schemas.requests import CommandName
-from servoscope.web.schemas.responses import ApiResponse, DiagnosisRow, JsonObject, NullableFloats, SignalColumns
+from servoscope.web.schemas.responses import (
+    ApiResponse,
+    DiagnosisRow,
+    FaultCheck,
+    JsonObject,
+    NullableFloats,
+    SignalColumns,
+)
 from servoscope.web.stored_diagnosis import read_diagnosis, stored_headline
 
 COMMAND_NAMES: tuple[CommandName, ...] = get_args(CommandName)

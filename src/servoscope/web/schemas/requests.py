@@ -260,3 +260,10 @@ class DesignRequest(ApiRequest):
     after_s: Annotated[float, Field(gt=0.0, le=3600.0, allow_inf_nan=False)] = 30.0
     noise_u_std: NoiseStd | None = None
     noise_y_std: NoiseStd | None = None
+
+
+class CheckRequest(ApiRequest):
+    """What to check on an asset for a fault; no text: as the loop or the plant says it."""
+
+    fault: Id
+    texts: Annotated[list[Annotated[str, Field(min_length=1, max_length=300)]], Field(max_length=10)]

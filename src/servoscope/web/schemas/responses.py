@@ -1,4 +1,4 @@
-"""What the interface answers of sessions, jobs, uploads, diagnoses, baselines and studies."""
+"""What the interface answers of sessions, jobs, uploads, diagnoses, baselines, studies, notifications and sizes."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ from typing import Any, ClassVar, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from servoscope.core.messages import MessageField
+from servoscope.design.operating_limits import OperatingLimit
 from servoscope.diagnosis.result import Verdict
+from servoscope.prognosis.forecast import Prognosis
 from servoscope.service.access import Role
 from servoscope.service.renewal import LearningProgress
+from servoscope.web.schemas.requests import NoteRequest
 from servoscope.web.stored_diagnosis import stored_headline
 
 JsonObject = dict[str, Any]  # a document of another package, passed on as it is
@@ -291,3 +294,79 @@ class DesignDetail(DesignRow):
     """A study before deployment."""
 
     study: JsonObject
+
+
+class FaultCheck(ApiResponse):
+    """What to check for a fault; `who` wrote it for this asset `at` [UTC s]; None: nobody, loop or plant say it."""
+
+    fault: str
+    label: str
+    texts: list[str]
+    who: str | None = None
+    at: float | None = None
+
+
+class NotificationOutlet(ApiResponse):
+    """A webhook, command, message or mail of the service file."""
+
+    name: str
+    kind: str  # webhook, command, mqtt or email
+    target: str
+    may_test: bool  # not what changes a machine
+    last: JsonObject | None  # newest notification: t, event, attempts, and outcome, empty before the first attempt
+
+
+class NotificationOutlets(ApiResponse):
+    """All of them."""
+
+    outlets: list[NotificationOutlet]
+
+
+class SizeCurve(ApiResponse):
+    """A fault or coefficient over time, as a ratio to healthy, with its 95 % intervals."""
+
+    name: str
+    kind: Literal["full", "live", "coefficient"]
+    t: list[float]
+    value: list[float]
+    low: list[float]
+    high: list[float]
+    healthy: list[float]
+
+
+class SizeHistory(ApiResponse):
+    """How faults and coefficients of an asset have changed; of each of `points` equal parts of the time one value."""
+
+    asset: str
+    curves: list[SizeCurve]
+
+
+class Note(NoteRequest, ApiResponse):
+    """What somebody noted about an asset."""
+
+    model_config = ConfigDict(extra="ignore")  # of later versions
+
+    who: str
+    kind: str = "note"  # type: ignore[assignment]
+
+
+class NoteList(ApiResponse):
+    """Notes in the order of time."""
+
+    notes: list[Note]
+
+
+class Forecast(Prognosis, ApiResponse):
+    """A prognosis of an asset, with its sentences as text."""
+
+    asset: str
+    # headline, reasons, effects: in the sentences
+    headline: MessageField = Field(exclude=True)
+    reasons: tuple[MessageField, ...] = Field((), exclude=True)
+    effects: dict[str, tuple[float, float, float]] = Field({}, exclude=True)
+
+
+class LimitList(ApiResponse):
+    """Limits by fault."""
+
+    limits: list[OperatingLimit]

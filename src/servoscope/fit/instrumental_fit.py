@@ -11,7 +11,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.estimation.instrument import FOLDS, InstrumentTuning, Source, fit_reference_model, fold_of
 from servoscope.estimation.noise_model import sample_autocovariance, yule_walker
 from servoscope.estimation.pipeline import Pipeline, Regression
-from servoscope.estimation.tuning import TuningFit, fit_tuning, least_squares
+from servoscope.fit.tuning import TuningFit, fit_tuning, least_squares
 from servoscope.signals import Recording
 
 MAX_ROUNDS = 20  # of refinement; a fit that needs more does not settle

@@ -12,15 +12,13 @@ from servoscope.core.errors import NotEnoughError
 from servoscope.estimation.noise_model import (
     AR_ORDER,
     ArmaNoise,
-    WhiteNoiseFit,
     arma_from_white_noise,
-    fit_white_noise,
     residual_system,
     sample_autocovariance,
-    whittle_cost,
     yule_walker,
 )
 from servoscope.estimation.pipeline import Pipeline, Regression, Tuning
+from servoscope.fit.white_noise import WhiteNoiseFit, fit_white_noise, whittle_cost
 from servoscope.models.lti import solve_scaled
 
 # smallest eigenvalue of the scaled R_phi, relative to the largest, that still counts as excited
