@@ -168,8 +168,7 @@ class Examination:
         if model is None:
             return np.full(3, np.nan)
         ratios, fit = model.ratios_of(self.pipeline, self.recording), self.whole_fit
-        judged = fit is not None and np.isfinite(ratios).any()
-        return np.append(ratios, mean_t2(*fit) / model.fit_limit if judged and fit is not None else np.nan)
+        return np.append(ratios, np.nan if fit is None or np.isnan(ratios).all() else mean_t2(*fit) / model.fit_limit)
 
     @cached_property
     def whole_fit(self) -> tuple[FloatArray, FloatArray] | None:

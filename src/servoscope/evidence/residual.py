@@ -24,7 +24,6 @@ from servoscope.detection.homogeneity import prediction_factor
 from servoscope.estimation.pipeline import Pipeline
 from servoscope.evidence.features import PAST_BUDGET
 from servoscope.evidence.kind import EvidenceKind, HealthyRecordings, Learned
-from servoscope.fit.tuning import least_squares
 from servoscope.signals import Recording
 
 MIN_RECORDINGS = 6  # so that five judge each: fewer do not tell a drift from scatter

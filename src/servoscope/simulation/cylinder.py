@@ -94,7 +94,6 @@ class CylinderTruth:
     # (N, 8): y [m], y', p_A [Pa], p_B, spool as a share of its full stroke, spool', bristle, p_S
     states: FloatArray
     laws: FloatArray  # (N, 12): `PARAMETERS` with faults and temperature, in the units of the rig
-    faults: tuple[FaultEvent, ...]
 
 
 PARAMETERS = (
@@ -206,8 +205,6 @@ def simulate_cylinder(
     if not np.isfinite(states).all():
         raise SimulationError("cylinder rig: the integration left all bounds, check its numbers or raise substeps")
     used = slice(settling, None)
-    first = np.zeros(r.size, dtype=bool)
-    first[0] = True
     channels = dict(zip(("p_A", "p_B", "p_S"), states[used, [2, 3, 7]].T.copy(), strict=True))
     recording = Recording(
         name="cylinder simulated",
@@ -216,17 +213,15 @@ def simulate_cylinder(
         u=u[used],
         y=y[used],
         sample_rate=rig.sample_rate,
-        restart=first,
+        restart=np.arange(r.size) == 0,
         run=np.zeros(r.size, dtype=np.int32),
         channels={**channels, "T_oil": temperature[used]},
     )
-    truth = CylinderTruth(
+    return recording, CylinderTruth(
         drive=acting[used],
         states=states[used],
         laws=laws[used],
-        faults=tuple(faults),
     )
-    return recording, truth
 
 
 def _forces(rig: CylinderRig, r: FloatArray, rng: np.random.Generator) -> FloatArray:
