@@ -75,7 +75,7 @@ def followed(one: DayMonitor, rows: Rows, lengths: list[int]) -> tuple[dict[str,
     state, history, statistics = one.start(), RowHistory(), []
     for i, block in enumerate(np.split(np.arange(len(rows)), np.cumsum(lengths))):
         part = rows[block]
-        history.add(part)
+        history.blocks.append(part)
         state, found = one.advance(DayState.unpack(state.pack()), part, history)
         statistics.append(found.statistic)
         if i % 3 == 0:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import json
 import time
@@ -277,6 +278,14 @@ def spool(folder: Path, write: Callable[[list[dict[str, float]]], str]) -> None:
 
 def lines_of(samples: list[dict[str, float]]) -> str:
     return "\n".join(";".join(repr(row[name]) for name in "truy") for row in samples)
+
+
+@pytest.mark.parametrize(("package", "limit"), [("spool", 40), ("lines", 30)])
+def test_a_transport_and_a_decoder_take_few_lines(project: Path, package: str, limit: int) -> None:
+    path = project / "examples" / "packages" / f"servoscope-{package}" / f"servoscope_{package}.py"
+    code = ast.unparse(ast.parse(path.read_text(encoding="utf-8"))).splitlines()  # without comments and empty lines
+    texts = [line for line in code if line.strip() and not line.strip().startswith('"""')]
+    assert len(texts) <= limit, len(texts)
 
 
 @pytest.mark.parametrize("check", CHECKS)

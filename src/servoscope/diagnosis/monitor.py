@@ -16,7 +16,7 @@ from servoscope.core.errors import BaselineError, RecordingError
 from servoscope.detection.covariate_monitor import CovariateHistory
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.monitor_constants import MonitorConstants, compatibility_key, deduplicate
-from servoscope.diagnosis.side_monitors import AssetValues, SideLanes, SideValues
+from servoscope.diagnosis.side_monitors import SideLanes, SideValues
 from servoscope.estimation.frequency_response import FrequencyResponse
 from servoscope.estimation.kernel.sample_steps import SAMPLE
 from servoscope.estimation.recursion import Recursion, structure_key
@@ -218,10 +218,24 @@ class Monitor:
         RecordingError
             If the shapes do not fit together, or a covariate is missing.
         """
+        new, trace = self.run_lanes(state if self.fleet else state[None], r, u, y, restart, channels=channels)
+        return (new, trace) if self.fleet else (new[0], trace.lane(0))
+
+    def run_lanes(
+        self,
+        states: FloatArray,
+        r: npt.ArrayLike,
+        u: npt.ArrayLike,
+        y: npt.ArrayLike,
+        restart: npt.ArrayLike | None = None,
+        *,
+        channels: Mapping[str, npt.ArrayLike] | None = None,
+    ) -> tuple[FloatArray, Trace]:
+        """Feed a block as `run` does; all shapes begin with the assets, even of one."""
         number = np.float32 if self._single_precision else np.float64
         signals = [np.atleast_2d(np.ascontiguousarray(signal, dtype=number)) for signal in (r, u, y)]
         shape = (len(self.baselines), signals[0].shape[1])
-        if any(signal.shape != shape for signal in signals) or state.shape != self._shape:
+        if any(signal.shape != shape for signal in signals) or states.shape != (shape[0], self._size):
             raise RecordingError(
                 f"r, u, y must have the same shape ({'assets, N' if self.fleet else 'N,'}) for {shape[0]} asset(s), "
                 "and the state must come from this monitor's init or run"
@@ -231,7 +245,7 @@ class Monitor:
             flags = np.atleast_2d(np.ascontiguousarray(restart, dtype=np.bool_))
             if flags.shape != shape:
                 raise RecordingError("restart must have the shape of r")
-        rows = np.ascontiguousarray(np.atleast_2d(state), dtype=np.float64)
+        rows = np.ascontiguousarray(states, dtype=np.float64)
         gaps = np.zeros(shape, dtype=np.bool_) if flags is None else flags
         if self._size > self._groups[0][1].size:
             rows = rows.copy()
@@ -245,7 +259,7 @@ class Monitor:
             new, out = recursion.run(rows, signals[0], signals[1], signals[2], flags)
         else:
             new, out, index = self._run_groups(rows, signals, flags)
-        return new if self.fleet else new[0], self._trace(out, index, first, beside)
+        return new, self._trace(out, index, first, beside)
 
     def _run_groups(
         self, rows: FloatArray, signals: list[npt.NDArray[Any]], flags: npt.NDArray[np.bool_] | None
@@ -275,7 +289,7 @@ class Monitor:
         if self._step is None or len(state) != self._size or state.ndim != 1:
             if self._sides.first.covariates is not None:
                 raise RecordingError("step knows no covariates, which this baseline has: use run")
-            if state.shape != self._shape or self.fleet or self._single_precision:
+            if state.shape != (self._size,) or self.fleet or self._single_precision:
                 raise RecordingError(
                     "step follows one asset: give the state of a monitor with one baseline, or use run"
                 )
@@ -330,23 +344,14 @@ class Monitor:
         for assets, recursion in self._groups:
             out[assets] = recursion.evaluate(rows[assets, : recursion.size])
         beside, last = self._sides.latest(np.atleast_2d(state)), int(rows[0, SAMPLE]) - 1
-        return self._trace(out[:, None, :], np.array([last]), last, beside)
+        trace = self._trace(out[:, None, :], np.array([last]), last, beside)
+        return trace if self.fleet else trace.lane(0)
 
     def covariate_history(self, state: FloatArray) -> CovariateHistory:
         """Return what the state of one asset knows of its covariates: by name, seconds before now, and values then."""
         return self._sides.first.covariate_history(state[self._side_at :])
 
-    @property
-    def _shape(self) -> tuple[int, ...]:
-        return (len(self.baselines), self._size) if self.fleet else (self._size,)
-
-    def _trace(
-        self,
-        out: npt.NDArray[Any],
-        index: npt.NDArray[np.int64],
-        first: int,
-        beside: SideValues,
-    ) -> Trace:
+    def _trace(self, out: npt.NDArray[Any], index: npt.NDArray[np.int64], first: int, beside: SideValues) -> Trace:
         """Return complete evaluations, shape (assets, K, row), as a trace; the block begins at sample `first`."""
         features = None if beside.features is None else beside.features.at(index)
         n, f = len(self._constants_of[0].expected_theta), np.asarray(self.loop.monitor.frequencies, dtype=np.float64)
@@ -363,23 +368,17 @@ class Monitor:
         }
         for name, values in self._shared_columns.items():
             columns[name] = np.broadcast_to(values[:, None], (*shape, *values.shape[1:]))
-        threshold: Any = self._limits
-        if not self.fleet:
-            columns = {name: values[0] for name, values in columns.items()}
-            response, threshold = (response[0][0], response[1][0]), self.baselines[0].thresholds.statistic
         expected = FrequencyResponse(f, columns.pop("H"), columns.pop("covariance of H"))
         trace = Trace(
             t=index / self.loop.sample_rate,
             names=self.pipeline.bank.names,
-            threshold=threshold,
+            threshold=self._limits,
             ifrf=FrequencyResponse(f, *response),
             ifrf_expected=expected,
-            features=features if features is None or self.fleet else features[0],
+            features=features,
             **columns,
         )
-        if self.fleet:
-            return self._sides.compare(trace, beside, index - first)
-        return self._sides.first.compare(trace, beside.assets.get(0, AssetValues()), index - first)
+        return self._sides.compare(trace, beside, index - first)
 
 
 def _ready_mask(updates: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:

@@ -86,10 +86,6 @@ class RowHistory:
 
     blocks: list[Rows] = field(default_factory=list)
 
-    def add(self, rows: Rows) -> None:
-        """Add a block."""
-        self.blocks.append(rows)
-
     def drop_until(self, until_us: int) -> None:
         """Drop blocks without rows after a time."""
         self.blocks = [block for block in self.blocks if len(block) and block.t_us[-1] > until_us]

@@ -79,16 +79,22 @@ def spark(session: SparkSession) -> Engine:
     def run(tasks: Sequence[Task]) -> Iterator[TaskResult]:
         step = max(1, WAVE * session.sparkContext.defaultParallelism)
         for i in range(0, len(tasks), step):
-            wave = tasks[i : i + step]
-            try:
-                yield from zip(wave, _run_tasks(session, wave), strict=True)
-            except Exception as error:
-                if not _is_stage_failure(error):
-                    raise
-                for task in wave:  # one of them kills its executor: alone, it takes no other with it
-                    yield task, _run_isolated(session, task)
+            yield from zip(tasks[i : i + step], _run_wave(session, tasks[i : i + step]), strict=True)
 
     return run
+
+
+def _run_wave(session: SparkSession, wave: Sequence[Task]) -> Iterator[dict[str, Any]]:
+    try:
+        yield from _run_tasks(session, wave)
+    except Exception as error:
+        if "stage failure" not in str(error):  # Spark itself failed, and not a task as often as it may
+            raise
+        if len(wave) == 1:
+            yield crash_result(wave[0])
+            return
+        for task in wave:  # one of them kills its executor: alone, it takes no other with it
+            yield from _run_wave(session, [task])
 
 
 def _run_tasks(session: SparkSession, wave: Sequence[Task]) -> list[dict[str, Any]]:
@@ -101,20 +107,6 @@ def _run_tasks(session: SparkSession, wave: Sequence[Task]) -> list[dict[str, An
 
     done = session.range(0, len(wave), 1, len(wave)).mapInArrow(work, "i long, result string").collect()
     return [json.loads(task.result) for task in sorted(done, key=lambda task: task.i)]
-
-
-def _run_isolated(session: SparkSession, task: Task) -> dict[str, Any]:
-    try:
-        return _run_tasks(session, [task])[0]
-    except Exception as error:
-        if not _is_stage_failure(error):
-            raise
-        return crash_result(task)
-
-
-def _is_stage_failure(error: Exception) -> bool:
-    """Return whether a task of Spark failed as often as it may, and not Spark itself."""
-    return "stage failure" in str(error)
 
 
 def diagnose(

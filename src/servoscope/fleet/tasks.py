@@ -185,7 +185,7 @@ def examine_day(monitor: DayMonitor, blocks: Iterable[Rows]) -> tuple[dict[str, 
     """Return the result of a day, whose rows come in the order of time, and its trace."""
     state, history, trace = monitor.start(), RowHistory(), []
     for rows in blocks:
-        history.add(rows)
+        history.blocks.append(rows)
         state, evaluations = monitor.advance(state, rows, history)
         history.drop_until(monitor.needed_since(state))
         trace.append(evaluations)

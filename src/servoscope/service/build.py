@@ -157,12 +157,9 @@ def open_source(config: ServiceFile, name: str, source: Inbox, assets: Mapping[s
 
 def resume_positions(config: ServiceFile, source: str, assets: Mapping[str, Asset]) -> dict[str, ResumePosition]:
     """Return where the assets of a source, by its name, go on."""
-    inboxes = {}
-    for name, asset in assets.items():
-        if config.assets[name].source == source and asset.state is not None and asset.heard:
-            position = asset.state.position
-            inboxes[name] = ResumePosition(position.sequence, position.began, position.stream, position.t)
-    return inboxes
+    own = {name: asset.state for name, asset in assets.items() if config.assets[name].source == source and asset.heard}
+    counted = {name: state.position for name, state in own.items() if state is not None}
+    return {name: ResumePosition(at.sequence, at.began, at.stream, at.t) for name, at in counted.items()}
 
 
 def build_assets(config: ServiceFile) -> dict[str, Asset]:
@@ -288,18 +285,18 @@ def _resolve_limits(baseline: AnyBaseline, limits: Mapping[str, float | LimitKin
 
 def source_assets(config: ServiceFile, assets: Mapping[str, Asset], source: str) -> dict[str, SourceAsset]:
     """Return what a source is told of its assets."""
-    key, sources = config.sources[source].asset_key, dict[str, SourceAsset]()
-    for name, asset in config.assets.items():
-        if asset.source == source:
-            baseline, address = assets[name].baseline, getattr(asset, key) if key else None
-            sources[name] = SourceAsset(
-                baseline.loop.carrier if isinstance(baseline, ArmBaseline) else baseline.loop,
-                address,
-                config.service.ahead_s,
-                baseline.logged_covariates,
-                is_arm=isinstance(baseline, ArmBaseline),
-            )
-    return sources
+    key = config.sources[source].asset_key
+    own = {name: assets[name].baseline for name, asset in config.assets.items() if asset.source == source}
+    return {
+        name: SourceAsset(
+            baseline.loop.carrier if isinstance(baseline, ArmBaseline) else baseline.loop,
+            getattr(config.assets[name], key) if key else None,
+            config.service.ahead_s,
+            baseline.logged_covariates,
+            is_arm=isinstance(baseline, ArmBaseline),
+        )
+        for name, baseline in own.items()
+    }
 
 
 def build_source(config: ServiceFile, assets: Mapping[str, Asset], name: str) -> Inbox:

@@ -17,19 +17,18 @@ from servoscope.core.settings_errors import describe_error
 Seconds = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-3, le=1e9)]  # what means something as a time
 
 
-def _check_name(value: str) -> str:
-    if not re.fullmatch(r"\w[\w.:-]{0,99}", value):
-        raise ValueError(
-            f"{value!r} is no name: letters, digits, _ and later also - . : are allowed, up to 100, no spaces"
-        )
-    return value
+PORT = "0*(?:[0-9]{1,4}|[1-5][0-9]{4}|6[0-4][0-9]{3}|65[0-4][0-9]{2}|655[0-2][0-9]|6553[0-5])"  # up to 65535
 
 
-def _check_address(value: str) -> str:
-    host, _, port = value.rpartition(":")
-    if value and not (host and port.isascii() and port.isdecimal() and int(port) <= 65535):
-        raise ValueError(f'{value!r} is no address, write "127.0.0.1:9464", or "" for none')
-    return value
+def matching(pattern: str, remedy: str) -> AfterValidator:
+    """Return the check that all of a text matches a regular expression; `remedy` may name the text as {value!r}."""
+
+    def check(value: str) -> str:
+        if not re.fullmatch(pattern, value):
+            raise ValueError(remedy.format(value=value))
+        return value
+
+    return AfterValidator(check)
 
 
 def _check_http_url(value: str) -> str:
@@ -43,8 +42,10 @@ def _check_http_url(value: str) -> str:
     return value
 
 
-Name = Annotated[str, Field(strict=True), AfterValidator(_check_name)]
-Address = Annotated[str, Field(strict=True), AfterValidator(_check_address)]
+NAME_REMEDY = "{value!r} is no name: letters, digits, _ and later also - . : are allowed, up to 100, no spaces"
+ADDRESS_REMEDY = '{value!r} is no address, write "127.0.0.1:9464", or "" for none'
+Name = Annotated[str, Field(strict=True), matching(r"\w[\w.:-]{0,99}", NAME_REMEDY)]
+Address = Annotated[str, Field(strict=True), matching(f"(?:.+:{PORT})?", ADDRESS_REMEDY)]
 HttpUrl = Annotated[str, Field(strict=True, min_length=1), AfterValidator(_check_http_url)]
 
 

@@ -62,16 +62,14 @@ class ServiceMetrics:
             raise ConfigError("prometheus-client is missing, pip install 'servoscope[service]'") from None
         self._service, self.registry = service, CollectorRegistry()
 
-        def histogram(name: str, text: str) -> Histogram:
-            return Histogram(f"servoscope_{name}_seconds", text, buckets=BUCKETS_S, registry=self.registry)
-
         def counter(name: str, text: str, labels: Sequence[str] = ()) -> Counter:
             return Counter(f"servoscope_{name}", text, labelnames=labels, registry=self.registry)
 
         self.failures = counter("store_failures", "Attempts to store that failed")
         # of blocks: how many in each bin, and their sum [s]; one by one they would take longer than a kernel
         self._latencies = np.zeros(len(BUCKETS_S) + 1, dtype=np.int64), 0.0
-        self._commits = histogram("commit", "Duration of a commit")
+        words = "Duration of a commit"
+        self._commits = Histogram("servoscope_commit_seconds", words, buckets=BUCKETS_S, registry=self.registry)
         self._alarms = TotalCounter[tuple[str, str, str]]()  # that are not normal, by name, priority and state
         self._render_s = 0.0  # processor time of `render` so far [s]
         self._rejections = counter("refused", "Messages that could not be used", ["source", "asset", "kind"])
@@ -169,20 +167,20 @@ def write_asset_series(assets: Mapping[str, Asset]) -> AssetSeries:
             last.append(f"servoscope_last_sample_time_seconds{{{label}}} {position.t}")
         verdict = asset_verdict(state.examination, quality.active_findings(state.quality), reception)
         verdicts.append(f'servoscope_verdict{{{label},verdict="{verdict}"}} 1.0')
-        alarms.update(asset.standing_alarms(state))
+        alarms.update(asset.alarms.standing(state.alarms))
     families = [(f"{key}_total", "counter", STREAM_COUNTERS[key], lines) for key, lines in counts.items()]
     families += [
         ("last_sample_time_seconds", "gauge", "Time of the last sample", last),
         ("reception", "gauge", "1 for how an asset's samples come in", receptions),
         ("verdict", "gauge", "1 for the verdict that holds", verdicts),
     ]
-    return AssetSeries("".join(_family_lines(*family) for family in families), alarms)
+    text = ""
+    for name, kind, words, lines in families:
+        heads = f"# HELP servoscope_{name} {words}", f"# TYPE servoscope_{name} {kind}"
+        text += "\n".join([*heads, *lines, ""])
+    return AssetSeries(text, alarms)
 
 
 def escape_label(value: str) -> str:
     """Return a value of a label as Prometheus reads it."""
     return value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
-
-
-def _family_lines(name: str, kind: str, words: str, lines: list[str]) -> str:
-    return "\n".join([f"# HELP servoscope_{name} {words}", f"# TYPE servoscope_{name} {kind}", *lines, ""])

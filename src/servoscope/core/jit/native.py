@@ -89,26 +89,48 @@ def _entry(arguments: Sequence[tuple[str, str]], result: str, *, brief: bool) ->
     A `brief` one keeps other threads waiting, which is faster.
     """
     kinds = [kind for _, kind in arguments]
-    lines = [f"declare {kind} @{name}(ptr)" for kind, name in CONVERSIONS.items()]
-    lines += [f"declare ptr @{name}(i64)" for name in ("PyBool_FromLong", "PyLong_FromLongLong")]
-    lines += ["declare ptr @PyFloat_FromDouble(double)", "declare i32 @PyErr_BadArgument()"]
-    lines += [f"declare ptr @{name}()" for name in ("PyErr_Occurred", "PyEval_SaveThread")]
-    lines += ["declare void @PyEval_RestoreThread(ptr)", "define ptr @call(ptr %self, ptr %objects, i64 %count) {"]
-    lines += [f"  %enough = icmp eq i64 %count, {len(kinds)}", "  br i1 %enough, label %convert, label %refuse"]
-    lines += ["refuse:", "  call i32 @PyErr_BadArgument()", "  ret ptr null", "convert:"]
-    for i, kind in enumerate(kinds):
-        lines += [f"  %p{i} = getelementptr ptr, ptr %objects, i64 {i}", f"  %o{i} = load ptr, ptr %p{i}"]
-        lines += [f"  %a{i} = call {kind} @{CONVERSIONS[kind]}(ptr %o{i})"]
-    lines += ["  %error = call ptr @PyErr_Occurred()", "  %clean = icmp eq ptr %error, null"]
-    lines += ["  br i1 %clean, label %go, label %fail", "fail:", "  ret ptr null", "go:"]
+    converted = "".join(
+        f"""
+  %p{i} = getelementptr ptr, ptr %objects, i64 {i}
+  %o{i} = load ptr, ptr %p{i}
+  %a{i} = call {kind} @{CONVERSIONS[kind]}(ptr %o{i})"""
+        for i, kind in enumerate(kinds)
+    )
     call = f"call {result} @run({', '.join(f'{kind} %a{i}' for i, kind in enumerate(kinds))})"
-    run = [f"  {call}" if result == "void" else f"  %result = {call}"]
-    if not brief:
-        run = ["  %thread = call ptr @PyEval_SaveThread()", *run, "  call void @PyEval_RestoreThread(ptr %thread)"]
-    kind, value = (result, "%result") if result in ("i64", "double") else ("i64", "%wide" if result == "i1" else "0")
-    widen = ["  %wide = zext i1 %result to i64"] if result == "i1" else []
-    back = f"  %object = call ptr @{RESULTS.get(result, 'PyBool_FromLong')}({kind} {value})"
-    return "\n".join(["", *lines, *run, *widen, back, "  ret ptr %object", "}", ""])
+    let_go, take_back = "%thread = call ptr @PyEval_SaveThread()", "call void @PyEval_RestoreThread(ptr %thread)"
+    value = {"void": "i64 0", "i1": "i64 %wide"}.get(result, f"{result} %result")
+    return f"""
+declare ptr @PyLong_AsVoidPtr(ptr)
+declare i64 @PyLong_AsLongLong(ptr)
+declare double @PyFloat_AsDouble(ptr)
+declare ptr @PyBool_FromLong(i64)
+declare ptr @PyLong_FromLongLong(i64)
+declare ptr @PyFloat_FromDouble(double)
+declare i32 @PyErr_BadArgument()
+declare ptr @PyErr_Occurred()
+declare ptr @PyEval_SaveThread()
+declare void @PyEval_RestoreThread(ptr)
+define ptr @call(ptr %self, ptr %objects, i64 %count) {{
+  %enough = icmp eq i64 %count, {len(kinds)}
+  br i1 %enough, label %convert, label %refuse
+refuse:
+  call i32 @PyErr_BadArgument()
+  ret ptr null
+convert:{converted}
+  %error = call ptr @PyErr_Occurred()
+  %clean = icmp eq ptr %error, null
+  br i1 %clean, label %go, label %fail
+fail:
+  ret ptr null
+go:
+  {"" if brief else let_go}
+  {call if result == "void" else f"%result = {call}"}
+  {"" if brief else take_back}
+  {"%wide = zext i1 %result to i64" if result == "i1" else ""}
+  %object = call ptr @{RESULTS.get(result, "PyBool_FromLong")}({value})
+  ret ptr %object
+}}
+"""
 
 
 def _compile(text: str, straight: bool = False) -> bytes:

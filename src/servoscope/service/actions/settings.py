@@ -9,22 +9,16 @@ from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from servoscope.core.settings import Finite, NonEmptyStr, Positive, Settings
 from servoscope.service.alarms import LifecycleEvent, LifecycleState, Priority
-from servoscope.service.config_types import HttpUrl, SecretSettings
+from servoscope.service.config_types import HttpUrl, SecretSettings, matching
 from servoscope.service.mqtt.client import BrokerSettings
 from servoscope.service.network import NetworkSettings, TlsSettings, apply_network
 
-
-def _check_name(value: str) -> str:
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", value):
-        raise ValueError(f"{value!r} is no name for an action: a letter, then letters, digits, _ and -")
-    return value
-
-
-ActionName = Annotated[str, Field(strict=True), AfterValidator(_check_name)]
+NAME_REMEDY = "{value!r} is no name for an action: a letter, then letters, digits, _ and -"
+ActionName = Annotated[str, Field(strict=True), matching("[A-Za-z][A-Za-z0-9_-]*", NAME_REMEDY)]
 PositiveInt = Annotated[int, Field(strict=True, ge=1)]
 
 DIAGNOSIS_EVENT = "diagnosed"  # an event that is none of the life-cycle: the cause of an alarm is known

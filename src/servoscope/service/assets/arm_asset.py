@@ -20,6 +20,7 @@ from servoscope.service.assets.examination_schedule import (
 )
 from servoscope.service.assets.records import NextBlock, StepResult, TableRow
 from servoscope.service.assets.residual_history import EvaluationStatus, LatestEvaluation, history_row
+from servoscope.service.clock import LayerTimes
 from servoscope.service.store.rows import coefficient_rows, fault_rows, period_number
 from servoscope.signals import quality
 
@@ -40,11 +41,12 @@ class ArmAsset(Asset):
         settings = settings.model_copy(update={"every_s": min(settings.every_s, settings.window_s)})
         super().__init__(name, baseline, ArmMonitor(baseline), replace(policy, diagnosis=settings), group, source)
 
-    def follow(self, accepted: NextBlock) -> Followed:
+    def follow(self, accepted: NextBlock, layers: LayerTimes) -> Followed:
         """Follow an accepted block: of its samples it counts which have all signals."""
         block, restart = accepted.block, accepted.continuity.is_broken
         whole = np.where(np.isfinite(block.covariates).all(axis=0), 0.0, np.nan)
-        return self.lanes.follow(self.monitor, self.take_state(), np.stack([block.t, *[whole] * 3]), restart=restart)
+        signals = np.stack([block.t, *[whole] * 3])
+        return self.lanes.follow(self.monitor, self.take_state(), signals, restart, layers)
 
     def _examine(self) -> None:
         """Ask for the diagnosis of the last minutes if that is due."""

@@ -47,6 +47,7 @@ from servoscope.service.assets.records import (
 )
 from servoscope.service.assets.states import AssetStates, RestPeriod, StateHolder
 from servoscope.service.assets.status import Announcement, AssetStatus, asset_metadata, asset_status
+from servoscope.service.clock import LayerTimes
 from servoscope.service.config import DiagnosisSettings
 from servoscope.service.sources.block import Block
 from servoscope.service.store.bundles import pack_samples
@@ -90,7 +91,7 @@ class Asset(StateHolder):
         self._metadata = asset_metadata(baseline, group, policy.diagnosis.window_s, source)
         self._limits = policy.quality.limits(self._rate, policy.pause_s)
         self.lanes = BlockLanes(self._rate, self._limits, policy.residual_every_s)
-        self._alarms = AssetAlarms(policy.alarms, policy.prognosis.ahead_s, limited=bool(policy.limits))
+        self.alarms = AssetAlarms(policy.alarms, policy.prognosis.ahead_s, limited=bool(policy.limits))
         self._window = RecentBlocks(name, policy.diagnosis.kept_s, self._rate)
         self._result, self._reception = StepResult([], []), RECEPTION_OK
         self._ticked = False  # whether silence has changed the state since the last block
@@ -99,7 +100,7 @@ class Asset(StateHolder):
         """Let the state be a row of `states`, until it is taken or another one is set."""
         state = self.take_state()
         since, until = rest_period(state.examination)
-        from_s, to_s = self._alarms.standstill(state, self.reception)
+        from_s, to_s = self.alarms.standstill(state, self.reception)
         undisturbed = self.reception == RECEPTION_OK and not self._ticked
         period = RestPeriod(state.examination.verdict == "fault", max(since, from_s), min(until, to_s))
         self._row = states.put(row, state, period if undisturbed else period._replace(until=-math.inf))
@@ -117,14 +118,15 @@ class Asset(StateHolder):
 
     def announce(self, announced: Announcement | None) -> None:
         """Let it learn again after what was done to it; None: it has learned."""
-        if announced != self._alarms.announced and self._state is not None:
+        if announced != self.alarms.announced and self._state is not None:
             self.take_state()
-        self._alarms.announced = announced
+        self.alarms.announced = announced
 
     def compile_kernels(self) -> None:
         """Compile what blocks need, so that the first one does not wait for it."""
         nothing, monitor = np.full(2, np.nan), self.monitor
-        monitor.run(monitor.init(), *(nothing,) * 3, channels=dict.fromkeys(self.baseline.logged_covariates, nothing))
+        channels = dict.fromkeys(self.baseline.logged_covariates, nothing)
+        monitor.run_lanes(monitor.init()[None], *(nothing,) * 3, channels=channels)
         quality.check_block(self._limits, quality.init_state(), np.arange(2.0), nothing, nothing, nothing)
 
     def resume(self, state: AssetState, stored: Iterable[Block]) -> list[Block]:
@@ -140,7 +142,7 @@ class Asset(StateHolder):
                 f"run --anew {self.name} begins with a new state, behind the samples counted"
             )
         t = state.position.t
-        alarms = self._alarms.begin(self.name, t, state.alarms)
+        alarms = self.alarms.begin(self.name, t, state.alarms)
         self.state = replace(state, alarms=alarms, quality=quality.restart_silence(state.quality, t))
         position, blocks = state.position, list(stored)
         counted = [block for block in blocks if block.sequence < position.blocks]
@@ -164,7 +166,7 @@ class Asset(StateHolder):
             quality=quality.init_state(),
             examination=ExaminationState.begin(position.t, self.policy.diagnosis, self._phase, self.policy.assets),
             # those that stand since before the first block go on
-            alarms=self._alarms.begin(self.name, position.t, standing),
+            alarms=self.alarms.begin(self.name, position.t, standing),
         )
 
     def expect(self, now: float) -> None:
@@ -173,12 +175,8 @@ class Asset(StateHolder):
 
     def status(self, state: AssetState) -> AssetStatus:
         """Return what users see of a state."""
-        about = self._alarms.definitions, self._metadata, self.reception, self._alarms.announced
+        about = self.alarms.definitions, self._metadata, self.reception, self.alarms.announced
         return asset_status(state, *about, self.policy.diagnosis.kept_s)
-
-    def standing_alarms(self, state: AssetState) -> list[tuple[str, str, str]]:
-        """Return name, priority and state of each alarm that is not normal."""
-        return self._alarms.standing(state.alarms)
 
     @property
     def first_needed_sequence(self) -> int:
@@ -186,13 +184,15 @@ class Asset(StateHolder):
         first = self._window.first_sequence
         return self.take_state().position.blocks if first is None else first
 
-    def process(self, block: Block, latest: float = math.inf) -> StepResult:
+    def process(self, block: Block, latest: float = math.inf, layers: LayerTimes | None = None) -> StepResult:
         """Process a block; one that was counted before has no effect, nor has one that is later than `latest` [UTC s].
 
         Raises RecordingError if it is no block: empty, without time, or of signals of different lengths.
         """
         accepted = self.accept(block, latest)
-        return accepted if isinstance(accepted, StepResult) else self.conclude(accepted, self.follow(accepted))
+        if isinstance(accepted, StepResult):
+            return accepted
+        return self.conclude(accepted, self.follow(accepted, layers or LayerTimes()))
 
     def accept(self, block: Block, latest: float = math.inf) -> NextBlock | StepResult:
         """Begin to process a block, as `process` does: return what is to be followed and concluded, or no effect."""
@@ -213,10 +213,10 @@ class Asset(StateHolder):
             return self._leave_out(block, "late", behind_s=position.t - start)
         return NextBlock(block, continuity)
 
-    def follow(self, accepted: NextBlock) -> Followed:
+    def follow(self, accepted: NextBlock, layers: LayerTimes) -> Followed:
         """Follow an accepted block alone."""
-        restart = accepted.continuity.is_broken
-        return self.lanes.follow(self.monitor, self.take_state(), accepted.block.signals, restart=restart)
+        state, restart = self.take_state(), accepted.continuity.is_broken
+        return self.lanes.follow(self.monitor, state, accepted.block.signals, restart, layers)
 
     def conclude(self, accepted: NextBlock, followed: Followed) -> StepResult:
         """Take what an accepted block has led to."""
@@ -271,7 +271,7 @@ class Asset(StateHolder):
         Raises AlarmError if there is no such alarm, or the command has no meaning in its state.
         """
         self._result = StepResult([], [])
-        self.state, transitions = self._alarms.execute(self.take_state(), alarm, command)
+        self.state, transitions = self.alarms.execute(self.take_state(), alarm, command)
         self._add_transitions(transitions)
         return self._result
 
@@ -361,7 +361,7 @@ class Asset(StateHolder):
         """Examine the last minutes if that is due, and request a full diagnosis of a new fault."""
         state, settings = self.take_state(), self.policy.diagnosis
         t, known = state.position.t, state.examination
-        details = state.evaluation.features, single_fault(known.faults), known.verdict, self._alarms.assesses
+        details = state.evaluation.features, single_fault(known.faults), known.verdict, self.alarms.assesses
         if is_at_rest(known, t, state.evaluation.exceeded):
             return
         recent = partial(self._window.after, t - settings.window_s)
@@ -391,10 +391,10 @@ class Asset(StateHolder):
 
     def _advance_alarms(self, t: float) -> None:
         """Update the alarms at time `t` [UTC s]."""
-        self.state, transitions = self._alarms.advance(self.take_state(), self.reception, t)
+        self.state, transitions = self.alarms.advance(self.take_state(), self.reception, t)
         self._add_transitions(transitions)
 
     def _add_transitions(self, transitions: Sequence[AlarmTransition]) -> None:
         self._result.transitions.extend(transitions)
         for transition in transitions:
-            self._add_row("transitions", **transition_row(transition, self._alarms.definitions[transition.alarm]))
+            self._add_row("transitions", **transition_row(transition, self.alarms.definitions[transition.alarm]))

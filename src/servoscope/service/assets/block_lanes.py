@@ -9,7 +9,6 @@ from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.detection.trace import Trace
@@ -33,14 +32,17 @@ Followed = tuple[AssetState, list[dict[str, Any]]]  # the state after a block bu
 class LaneEvaluations:
     """The evaluations of a block of each of several assets, at `times` [UTC s], shape (assets, K), K > 0.
 
-    What is judged of them, of each asset: `exceeded`, whether the last one is above a limit; `peaks`, of the whole
-    block, shape (3, assets); `t`, time of the last one [UTC s]; `periods` of the history in which they lie, shape
-    (assets, K).
+    What is judged of them, of each asset: `exceeded`, whether the last one is above a limit; `peaks` of the block, the
+    largest T^2 over its limit, the largest sequential test, and T^2 for the history, shape (3, assets); `t`, time of
+    the last one [UTC s]; `periods` of the history in which they lie, shape (assets, K).
     """
 
     def __init__(self, trace: Trace, times: FloatArray, every_s: float) -> None:
         self._trace, self._times, self._every_s = trace, times, every_s
-        self.exceeded, self.peaks, self.t = trace.exceeded[:, -1], _peaks(trace), times[:, -1]
+        self.exceeded, self.t = trace.exceeded[:, -1], times[:, -1]
+        excess = np.nan_to_num(trace.statistic / trace.threshold).max(axis=-1)
+        # the history counts T^2 only where the estimator has learned something
+        self.peaks = np.array([excess, trace.level.max(axis=-1), known_excess(trace).max(axis=-1, initial=0.0)])
         self.periods = np.floor(times / every_s)
         self._last = cache(partial(LastEvaluations, trace))  # most are replaced before anybody looks
 
@@ -78,7 +80,7 @@ class LanesOutput(NamedTuple):
 
     monitor: FloatArray  # shape (assets, size)
     quality: FloatArray  # shape (assets, size)
-    t: FloatArray  # time of the last sample, shape (assets,) [UTC s]
+    t: FloatArray  # time of the last sample, shape (assets,), NaN where none has one [UTC s]
     size: int  # samples of each block
     evaluations: LaneEvaluations | None  # None: the blocks have none
 
@@ -93,7 +95,7 @@ class LanesOutput(NamedTuple):
             monitor=self.monitor[lane].copy(),  # an asset that falls silent must not hold the arrays of all others
             quality=self.quality[lane].copy(),
             samples=state.samples + self.size,
-            last_t=float(self.t[lane]),
+            last_t=None if np.isnan(t := float(self.t[lane])) else t,
             history=history,
             evaluation=latest,
         )
@@ -107,7 +109,9 @@ class BlockLanes:
         self._rate, self._limits, self._residual_every_s = rate, limits, residual_every_s
         self._timebase = Timebase(1.0 / rate)
 
-    def follow(self, monitor: AnyMonitor, state: AssetState, block: FloatArray, *, restart: bool) -> Followed:
+    def follow(
+        self, monitor: AnyMonitor, state: AssetState, block: FloatArray, restart: bool, layers: LayerTimes
+    ) -> Followed:
         """Follow a block of one asset, in whatever order its samples are.
 
         `block`: t, r, u, y and covariates, shape (4 + k, N); `restart`: whether samples before it are missing.
@@ -118,26 +122,14 @@ class BlockLanes:
         t, signals = block[0, order.rows], block[1:, order.rows]
         r, u, y, *covariates = np.where(np.isfinite(signals), signals, np.nan)
         channels = dict(zip(monitor.baselines[0].logged_covariates, covariates, strict=False))
-        new, trace = monitor.run(state.monitor, r, u, y, order.restart, channels=channels)
+        layers.enter("kernel")
+        new, trace = monitor.run_lanes(state.monitor[None], r, u, y, order.restart, channels=channels)
+        layers.enter("quality")
         checked, _ = quality.check_block(self._limits, state.quality, *block[:4, order.order])
-        last_t = order.t if np.isfinite(order.t) else None
-        checked, _ = quality.tick(self._limits, checked, state.position.t if last_t is None else last_t)
-        times = t[self._evaluated_samples(trace, state.samples)]
-        history, rows = update_history(state.history, trace, times, self._residual_every_s)
-        evaluation = state.evaluation
-        if times.size:
-            excess, level, _ = _peaks(trace).tolist()
-            evaluation = LatestEvaluation.from_trace(trace, float(times[-1]), (excess, level))
-        after = evolve(
-            state,
-            monitor=new,
-            quality=checked,
-            samples=state.samples + len(t),
-            last_t=last_t,
-            history=history,
-            evaluation=evaluation,
-        )
-        return after, rows
+        checked, _ = quality.tick(self._limits, checked, order.t if np.isfinite(order.t) else state.position.t)
+        layers.enter("judge")
+        evaluations = self._evaluate(trace, t[None], state.samples)
+        return LanesOutput(new, checked[None], np.array([order.t]), len(t), evaluations).lane(0, state)
 
     def are_regular(self, t: FloatArray, last: FloatArray) -> BoolArray:
         """Tell which of some blocks, with times `t` (blocks, N), need no sorting, nor a second look at what was `last`.
@@ -177,19 +169,11 @@ class BlockLanes:
         layers.enter("quality")
         checked = quality.check_lanes(self._limits, before[1], t, given)
         layers.enter("judge")
-        times = t[:, self._evaluated_samples(trace, samples)]
-        evaluations = LaneEvaluations(trace, times, self._residual_every_s) if times.shape[1] else None
-        return LanesOutput(monitors, checked, t[:, -1].copy(), t.shape[1], evaluations)
+        return LanesOutput(monitors, checked, t[:, -1].copy(), t.shape[1], self._evaluate(trace, t, samples))
 
-    def _evaluated_samples(self, trace: Trace, samples: int) -> npt.NDArray[np.int64]:
-        """Return at which of a block's samples the evaluations are; `samples` were processed before it."""
-        return np.rint(trace.t * self._rate).astype(np.int64) - samples
-
-
-def _peaks(trace: Trace) -> FloatArray:
-    """Return the largest T^2 of a block, over its limit, the largest sequential test, and T^2 for the history.
-
-    Shape (3, ...). The history counts T^2 only where the estimator has learned something.
-    """
-    excess = np.nan_to_num(trace.statistic / trace.threshold).max(axis=-1)
-    return np.array([excess, trace.level.max(axis=-1), known_excess(trace).max(axis=-1, initial=0.0)])
+    def _evaluate(self, trace: Trace | None, t: FloatArray, samples: int) -> LaneEvaluations | None:
+        """Return the evaluations of blocks with the times `t`, shape (blocks, N); `samples` were processed before."""
+        if trace is None:
+            return None
+        times = t[:, np.rint(trace.t * self._rate).astype(np.int64) - samples]
+        return LaneEvaluations(trace, times, self._residual_every_s) if times.shape[1] else None

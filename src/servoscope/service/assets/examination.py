@@ -18,7 +18,7 @@ from servoscope.core.messages import Message, message, render
 from servoscope.detection.covariate_monitor import CovariateHistory, fill_channels
 from servoscope.detection.warm_up import COURSE_CHANNELS
 from servoscope.diagnosis.dates import TIMELINES
-from servoscope.diagnosis.result import Verdict
+from servoscope.diagnosis.result import Diagnosis, Verdict
 from servoscope.isolation.candidate import FaultEstimate
 from servoscope.service.sources.block import Block
 from servoscope.signals import Recording, clean
@@ -192,40 +192,38 @@ def diagnose_blocks(baseline: AnyBaseline, name: str, blocks: Sequence[Block]) -
     of the window, its key ``began``; those of the headline are dates, because months later nobody knows when the window
     began.
     """
+    try:
+        if isinstance(baseline, ArmBaseline):
+            diagnosis, start, details = _diagnose_arm(baseline, name, blocks)
+        else:
+            diagnosis, start, details = _diagnose_loop(baseline, name, blocks)
+    except ServoscopeError as error:
+        return undetermined("unusable", error=str(error))
+    document = {**diagnosis.model_dump(mode="json"), "began": start, **details}
+    onset = start + diagnosis.onset_s[1] if diagnosis.onset_s is not None else None
+    headline = diagnosis.dated_headline(start)
+    return StoredDiagnosis(verdict=diagnosis.verdict, headline=headline, onset=onset, document=document)
+
+
+def _diagnose_loop(baseline: Baseline, name: str, blocks: Sequence[Block]) -> tuple[Diagnosis, float, dict[str, Any]]:
     from servoscope.diagnosis.diagnose import diagnose
     from servoscope.diagnosis.motion_signature import signature_columns
     from servoscope.diagnosis.verify import provenance
 
-    if isinstance(baseline, ArmBaseline):
-        return _diagnose_arm(baseline, name, blocks)
-    try:
-        recording, start = blocks_to_recording(baseline, name, blocks)
-        diagnosis = diagnose(baseline, recording)
-        diagnosis = diagnosis.model_copy(update={"provenance": provenance(baseline, recording)})
-    except ServoscopeError as error:
-        return undetermined("unusable", error=str(error))
+    recording, start = blocks_to_recording(baseline, name, blocks)
+    diagnosis = diagnose(baseline, recording)
+    diagnosis = diagnosis.model_copy(update={"provenance": provenance(baseline, recording)})
     since = diagnosis.onset_s[1] if diagnosis.onset_s is not None else None
-    onset = start + since if since is not None else None
-    signature = signature_columns(recording, baseline.loop, since)
-    document = {**diagnosis.model_dump(mode="json"), "began": start, "signature": signature}
-    headline = diagnosis.dated_headline(start)
-    return StoredDiagnosis(verdict=diagnosis.verdict, headline=headline, onset=onset, document=document)
+    return diagnosis, start, {"signature": signature_columns(recording, baseline.loop, since)}
 
 
-def _diagnose_arm(baseline: ArmBaseline, name: str, blocks: Sequence[Block]) -> StoredDiagnosis:
+def _diagnose_arm(baseline: ArmBaseline, name: str, blocks: Sequence[Block]) -> tuple[Diagnosis, float, dict[str, Any]]:
     from servoscope.diagnosis.arm import examine_window
 
     t, _, _, _, *signals = np.concatenate([block.signals for block in blocks], axis=1)
-    try:
-        window = examine_window(baseline, name, t, dict(zip(baseline.logged_covariates, signals, strict=True)))
-    except ServoscopeError as error:
-        return undetermined("unusable", error=str(error))
-    diagnosis, start = window.diagnosis, window.start
-    picture = window.examination.picture(baseline, diagnosis)
-    document = {**diagnosis.model_dump(mode="json"), "began": start, "evidence": window.excess, "arm": picture}
-    onset = start + diagnosis.onset_s[1] if diagnosis.onset_s is not None else None
-    headline = diagnosis.dated_headline(start)
-    return StoredDiagnosis(verdict=diagnosis.verdict, headline=headline, onset=onset, document=document)
+    window = examine_window(baseline, name, t, dict(zip(baseline.logged_covariates, signals, strict=True)))
+    picture = window.examination.picture(baseline, window.diagnosis)
+    return window.diagnosis, window.start, {"evidence": window.excess, "arm": picture}
 
 
 def carry_covariates(

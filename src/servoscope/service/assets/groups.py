@@ -120,18 +120,11 @@ class AssetGroups:
             yield BlockResult(block, self._process_alone(block, latest))
 
     def _process_alone(self, block: Block, latest: float) -> StepResult | ServoscopeError:
-        asset = self._assets[block.asset]
         self.layers.enter("judge")
         try:
-            accepted = asset.accept(block, latest)
+            return self._assets[block.asset].process(block, latest, self.layers)
         except ServoscopeError as error:
             return error
-        if isinstance(accepted, StepResult):
-            return accepted
-        self.layers.enter("kernel")
-        followed = asset.follow(accepted)
-        self.layers.enter("judge")
-        return asset.conclude(accepted, followed)
 
     def _process_together(
         self, fleet: _Fleet, placed: Sequence[_PlacedBlock], signals: FloatArray, latest: float, alone: list[Block]

@@ -41,16 +41,16 @@ class EvaluationStatus(BaseModel):
 class LastEvaluations:
     """The last evaluation of a block of each of several assets as arrays, of which a status is a row.
 
-    `trace`: of a fleet, or of one asset. Of many assets together it takes a tenth of one by one.
+    Of many assets together it takes a tenth of one by one.
     """
 
     def __init__(self, trace: Trace) -> None:
-        at = (slice(None) if trace.statistic.ndim == 2 else None, -1)  # of each array, shape (assets, ...)
+        at = slice(None), -1  # of each array, shape (assets, ...)
         excess = np.nan_to_num(trace.statistic / trace.threshold)
         std = np.sqrt(np.maximum(np.diagonal(trace.covariance[at], axis1=-2, axis2=-1), 0.0))
         parameters = np.stack([trace.theta[at], std, trace.expected[at]], axis=-1)
         responses, ready = response_rows(trace.ifrf, trace.ifrf_expected, at), trace.ready[at][:, None]
-        statistics = excess[at], trace.level[at], excess.max(axis=-1).ravel(), trace.level.max(axis=-1).ravel()
+        statistics = excess[at], trace.level[at], excess.max(axis=-1), trace.level.max(axis=-1)
         self._statistics, self._exceeded = np.stack(statistics, axis=-1), trace.exceeded[at]
         self._features = None if trace.features is None else trace.features[at]
         self._residual, self._names = ifrf_residual(trace, at), trace.names
@@ -93,12 +93,6 @@ class LatestEvaluation:
     ) -> None:
         self.exceeded, self.peaks, self.features, self.t = exceeded, peaks, features, t
         self._write = write
-
-    @classmethod
-    def from_trace(cls, trace: Trace, t: float, peaks: tuple[float, float]) -> LatestEvaluation:
-        """Return the last evaluation of a block of one asset, at `t` [UTC s]."""
-        features = None if trace.features is None else float(trace.features[-1])
-        return cls(bool(trace.exceeded[-1]), peaks, features, t, lambda: LastEvaluations(trace).status(0, t))
 
     @classmethod
     def from_status(cls, status: EvaluationStatus) -> LatestEvaluation:

@@ -9,12 +9,12 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
 from servoscope.core.errors import ConfigError
 from servoscope.core.messages import message, render
 from servoscope.core.settings import NonEmptyStr
-from servoscope.service.config_types import read_password
+from servoscope.service.config_types import PORT, matching, read_password
 from servoscope.service.log import log
 from servoscope.service.mapping.rows import MessageMapping
 from servoscope.service.mapping.settings import PayloadSettings
@@ -28,14 +28,7 @@ SESSION_MS = 6000  # after a kill so long, the brokers give our partitions away,
 AT_ONCE = 500  # messages that one call returns
 
 
-def _check_broker(value: str) -> str:
-    host, _, port = value.rpartition(":")
-    if not (host and port.isascii() and port.isdecimal() and int(port) <= 65535):
-        raise ValueError(f"{value!r} is no address, write kafka.example:9092")
-    return value
-
-
-Broker = Annotated[str, Field(strict=True), AfterValidator(_check_broker)]
+Broker = Annotated[str, Field(strict=True), matching(f".+:{PORT}", "{value!r} is no address, write kafka.example:9092")]
 
 
 class KafkaSourceSettings(TlsSettings, SourceSettings):

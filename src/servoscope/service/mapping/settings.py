@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from servoscope.core.settings import Finite, NonEmptyStr, NonNegative, Positive, Settings
 from servoscope.models.loop import TimeZone
-from servoscope.service.config_types import Seconds
+from servoscope.service.config_types import Seconds, matching
 from servoscope.service.mapping.paths import ASSET, SIGNAL, RowPath, TextPattern
 
 TimeUnit = Literal["s", "ms", "us", "ns", "iso"]
@@ -43,13 +43,8 @@ FORMS: dict[str, dict[str, Any]] = {  # keys that a form brings; those of the se
 }
 
 
-def _check_pattern(value: str) -> str:
-    if "+" in value or "#" in value or "\0" in value:
-        raise ValueError("write a name in braces for a level that may be anything: plant/{line}/{asset}/data")
-    return value
-
-
-Topic = Annotated[str, Field(strict=True, min_length=1, max_length=500), AfterValidator(_check_pattern)]
+TOPIC_REMEDY = "write a name in braces for a level that may be anything: plant/{{line}}/{{asset}}/data"
+Topic = Annotated[str, Field(strict=True, min_length=1, max_length=500), matching(r"[^+#\0]*", TOPIC_REMEDY)]
 Text = Annotated[str, Field(strict=True)]
 
 

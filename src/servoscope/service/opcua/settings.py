@@ -26,10 +26,6 @@ class CertificateSettings(Settings):
             raise ValueError("cert_file and key_file belong together")
         return self
 
-    def certificate_bytes(self, folder: Path) -> bytes:
-        """Return our certificate, DER or PEM; empty where there is none."""
-        return (folder / self.cert_file).read_bytes() if self.cert_file is not None else b""
-
     def certificate(self, folder: Path) -> tuple[str, str] | None:
         """Return the paths of certificate and key, if there is one."""
         if self.cert_file is None or self.key_file is None:
@@ -85,7 +81,8 @@ def describe_expiry(client: Any, folder: Path, settings: CertificateSettings, no
     """
     from cryptography import x509
 
-    certificates = {"our": settings.certificate_bytes(folder), "server": client.security_policy.peer_certificate}
+    own = b"" if settings.cert_file is None else (folder / settings.cert_file).read_bytes()  # DER or PEM
+    certificates = {"our": own, "server": client.security_policy.peer_certificate}
     words = []
     for whose, raw in certificates.items():
         load = x509.load_pem_x509_certificate if raw and raw.startswith(b"-----") else x509.load_der_x509_certificate

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import re
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -12,14 +11,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
 from servoscope.core.addresses import show_address
 from servoscope.core.errors import ConfigError
 from servoscope.core.messages import message, render
 from servoscope.core.settings import NonEmptyStr
 from servoscope.service.assets.reception import Reception
-from servoscope.service.config_types import Seconds, read_password
+from servoscope.service.config_types import Seconds, matching, read_password
 from servoscope.service.log import log
 from servoscope.service.network import ConnectionSettings
 from servoscope.service.opcua.settings import (
@@ -36,7 +35,6 @@ from servoscope.service.opcua.subscriptions import (
     ItemTerms,
     ScalarSubscription,
     monitor_nodes,
-    publishing_interval,
     shorten_interval,
     timestamp,
 )
@@ -51,10 +49,8 @@ RECONNECT_S = 1.0  # between two attempts to connect
 SERVER_TIME = "i=2258"  # Server_ServerStatus_CurrentTime, which every server has
 
 
-def _check_url(value: str) -> str:
-    if not re.fullmatch(r"opc\.tcp://[^\s/]+(/.*)?", value):
-        raise ValueError("is no address, write opc.tcp://host:4840")  # it may hold a password
-    return value
+# the message does not name the address, which may hold a password
+URL_CHECK = matching(r"opc\.tcp://[^\s/]+(/.*)?", "is no address, write opc.tcp://host:4840")
 
 
 class OpcuaSourceSettings(ConnectionSettings, CertificateSettings, SourceSettings):
@@ -65,7 +61,7 @@ class OpcuaSourceSettings(ConnectionSettings, CertificateSettings, SourceSetting
 
     kind: Literal["opcua"]
     # of the server, ``opc.tcp://host:4840``
-    url: Annotated[str, Field(strict=True), AfterValidator(_check_url)]
+    url: Annotated[str, Field(strict=True), URL_CHECK]
     # user, password_file: who we are; the password is the first line of a file, relative to the service file
     user: NonEmptyStr | None = None
     password_file: NonEmptyStr | None = None
@@ -247,7 +243,8 @@ class OpcuaTransport(ThreadTransport):
 
         A server may grant less than it was asked for: where its queues are shorter, messages have to come sooner.
         """
-        period, heartbeat = publishing_interval(subscription), self.settings.heartbeat
+        period = float(subscription.parameters.RequestedPublishingInterval) / 1000.0  # as the server has revised it [s]
+        heartbeat = self.settings.heartbeat
         wanted = {
             node: ItemTerms(subscription.sampling_ms, subscription.queue_size(period))
             for subscription in self._subscriptions

@@ -87,11 +87,6 @@ async def monitor_nodes(subscription: Any, wanted: Mapping[str, ItemTerms], firs
     }
 
 
-def publishing_interval(subscription: Any) -> float:
-    """Return the time between two messages of a subscription, as the server has revised it [s]."""
-    return float(subscription.parameters.RequestedPublishingInterval) / 1000.0
-
-
 async def shorten_interval(subscription: Any, interval_s: float) -> float:
     """Ask for messages that come so much sooner [s]; return what is granted."""
     from asyncua import ua

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import zlib
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -123,10 +122,6 @@ class Block:
     def signals(self) -> FloatArray:
         """t, r, u, y and the covariates as rows, shape (4 + k, N)."""
         return np.stack([self.t, self.r, self.u, self.y, *self.covariates])
-
-    def digest(self, before: int = 0) -> int:
-        """Return the CRC-32 of its samples, continued from that of the blocks before it."""
-        return zlib.crc32(self.signals.tobytes(), before)
 
     def pack(self) -> bytes:
         """Return its samples as bytes, from which `unpack` restores them bit by bit."""

@@ -99,7 +99,7 @@ class BundleIndex:
         for (bundle, number), (parts, samples) in bundles.items():
             self._hold((bundle, number), parts)
             self._number = max(self._number, number)
-            contents = _write_contents(parts)
+            contents = msgspec.json.encode(parts).decode()
             changes.new.append({"bundle": bundle, "number": number, "contents": contents, "samples": b"".join(samples)})
         return changes
 
@@ -141,10 +141,6 @@ def restore_times(stored: bytes) -> bytes:
     n = len(signals) // 8 // (3 + k)
     t: FloatArray = first + np.arange(n) / rate
     return t.astype("<f8").tobytes() + signals + covariate_tail(k)
-
-
-def _write_contents(parts: Sequence[BundlePart]) -> str:
-    return msgspec.json.encode(parts).decode()
 
 
 def _read_contents(contents: str) -> list[BundlePart]:
