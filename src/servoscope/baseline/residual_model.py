@@ -16,6 +16,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from pydantic import Field
 
+from servoscope.baseline.covariates import CovariatePath
 from servoscope.baseline.feature_model import FeatureGroup, GroupStatistic, is_near
 from servoscope.baseline.records import BaselineModel, Matrix, Vector
 from servoscope.core import outofcore
@@ -29,6 +30,7 @@ CLASSES = 2 * len(SPEED_SHARES) + 1
 POSITIONS = 6  # classes of position
 CORRELATIONS = 4  # with acceleration and position, each by itself and by direction
 SIZE = CLASSES + CORRELATIONS + 1  # number of features
+MIN_SAMPLES_PER_COEFFICIENT = 20  # usable samples that are fitted
 FADE_S = 0.1  # time in a class at which its mean counts half
 SAME_MOTION_RATIO = 1.6  # of rms position, speed and acceleration of r, up to which two recordings move alike
 MIN_SHARE = 1e-4  # of the rms of eta: a smaller difference is no evidence
@@ -201,6 +203,21 @@ class ResidualModel(BaselineModel):
         More than half a recording is not surer: what differs from day to day does not average.
         """
         return np.array(self.halves) * max(1.0, 0.5 * self.samples / max(samples, 1.0))
+
+    def deviation_of_rows(
+        self, pipeline: Pipeline, recording: Recording, rows: slice, theta: FloatArray, along: CovariatePath | None
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Return a fit to some rows minus the healthy theta (n,), and how such fits scatter, (n, n).
+
+        NaN where the rows do not show a coefficient; None where they are few, or healthy fits were not compared.
+        """
+        part = recording.rows(rows)
+        g = pipeline.regression(part.r, part.u, part.y, part.restart) if self.halves else None
+        if g is None or (samples := int(g.ok.sum())) < MIN_SAMPLES_PER_COEFFICIENT * len(theta):
+            return None
+        if along is not None:
+            theta = along.expected(np.arange(recording.samples)[rows][g.ok]).mean(axis=0)
+        return fit_coefficients(g, np.array(self.rms or 0.0)) - theta, self.stretch_covariance(samples)
 
     def detectable_changes(self, directions: Mapping[str, FloatArray], covariance: FloatArray) -> dict[str, float]:
         """Return the smallest relative changes that leave the limit of the fit, by parameter; infinite: none does.

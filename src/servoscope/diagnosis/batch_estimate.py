@@ -105,11 +105,12 @@ def isolation_inputs(exam: Examination, onset: Onset, at: int) -> tuple[list[Sig
     elif exam.pressures is not None:
         begin = onset.sample // round(PIECE_S * recording.sample_rate)
         return pressure_inputs(exam.pressures, exam.baseline.plant, begin)
-    else:
+    elif (model := exam.baseline.residual) is not None:
         begin = onset.sample
         if last - begin < exam.pipeline.memory_samples:  # such an onset is hardly known: all of its interval counts
             begin = round((onset.low_s - float(recording.t[0])) * recording.sample_rate)
-        stretch = exam.deviation_of_rows(slice(begin, last + 1))
+        rows, theta = slice(begin, last + 1), np.array(exam.baseline.theta)
+        stretch = model.deviation_of_rows(exam.pipeline, recording, rows, theta, exam.along)
         whole = stretch if stretch is not None and np.isfinite(stretch[0]).all() else None
     deviation, covariance = whole or recursive
     expectation = exam.expectation(first, last + 1) if exam.noise is not None else None

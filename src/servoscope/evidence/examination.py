@@ -1,8 +1,4 @@
-"""One recording against one baseline: the estimates, what a healthy loop would have shown, and the statistics.
-
-A recording of any length is read once, chunk by chunk; later questions about single evaluations are answered from the
-samples that they have not forgotten.
-"""
+"""One recording against one baseline: the estimates, what a healthy loop would have shown, and the statistics."""
 
 from __future__ import annotations
 
@@ -20,7 +16,7 @@ from servoscope.baseline.covariates import CovariatePath
 from servoscope.baseline.expectation import Expectation, ReferencePath, reference_path, residual_noise_model
 from servoscope.baseline.motion import RecordedMotion
 from servoscope.baseline.pressure_model import PressureEvidence
-from servoscope.baseline.residual_model import fit_coefficients, mean_t2
+from servoscope.baseline.residual_model import mean_t2
 from servoscope.core import outofcore
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import RecordingError
@@ -44,7 +40,6 @@ MAX_COVARIATE_T2 = 1.0  # T^2 of what covariates do within a recording, from whi
 AT_ONCE = 4096  # evaluations
 FORGOTTEN_SHARE = 1e-9  # share of the past below which it counts as forgotten
 MEMORIES = 22.0  # after which it usually is
-MIN_SAMPLES_PER_COEFFICIENT = 20  # usable samples that are fitted
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,10 +155,7 @@ class Examination:
 
     @cached_property
     def residual_ratios(self) -> FloatArray:
-        """What the healthy coefficients leave of u over its limits, and how far a fit is from them, shape (3,).
-
-        See `ResidualModel.ratios`; NaN: no evidence.
-        """
+        """`ResidualModel.ratios`, and how far a fit is from healthy over its limit, shape (3,); NaN: no evidence."""
         model = None if self.quick else self.baseline.residual
         if model is None:
             return np.full(3, np.nan)
@@ -172,24 +164,11 @@ class Examination:
 
     @cached_property
     def whole_fit(self) -> tuple[FloatArray, FloatArray] | None:
-        """`deviation_of_rows` of the whole recording; None where it is `quick`, too."""
-        return None if self.quick else self.deviation_of_rows(slice(None))
-
-    def deviation_of_rows(self, rows: slice) -> tuple[FloatArray, FloatArray] | None:
-        """Return theta of some rows minus its healthy expectation, (n,), and how such fits scatter, (n, n).
-
-        NaN where the rows do not show a coefficient; None where they are few, or healthy fits were not compared.
-        """
-        model, part = self.baseline.residual, self.recording.rows(rows)
-        if model is None or not model.halves:
+        """`ResidualModel.deviation_of_rows` of all rows; None where nothing was learned or it is `quick`."""
+        if self.quick or (model := self.baseline.residual) is None:
             return None
-        g = self.pipeline.regression(part.r, part.u, part.y, part.restart)
-        if (samples := int(g.ok.sum())) < MIN_SAMPLES_PER_COEFFICIENT * g.phi.shape[1]:
-            return None
-        expected = np.array(self.baseline.theta)
-        if self.along is not None:
-            expected = self.along.expected(np.arange(self.recording.samples)[rows][g.ok]).mean(axis=0)
-        return fit_coefficients(g, np.array(model.rms or 0.0)) - expected, model.stretch_covariance(samples)
+        theta = np.array(self.baseline.theta)
+        return model.deviation_of_rows(self.pipeline, self.recording, slice(None), theta, self.along)
 
     @cached_property
     def pressures(self) -> PressureEvidence | None:
