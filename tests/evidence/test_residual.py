@@ -9,8 +9,17 @@ import numpy as np
 import pytest
 
 import servoscope as ss
-from servoscope.baseline.residual_model import CLASSES, FADE_S, SIZE, ResidualLayout, ResidualModel
+from servoscope.baseline.residual_model import (
+    CLASSES,
+    FADE_S,
+    SIZE,
+    ResidualLayout,
+    ResidualModel,
+    fit_coefficients,
+    mean_t2,
+)
 from servoscope.evidence.examination import Examination
+from servoscope.evidence.residual import further_covariance
 from servoscope.signals import Recording
 from servoscope.simulation import CylinderRig, FaultEvent, cylinder_motion, simulate_cylinder
 
@@ -73,9 +82,9 @@ def test_features_are_those_of_the_obvious_way(learned: ss.Baseline) -> None:
 def test_healthy_days_are_healthy_and_a_fault_shows_in_whole_or_half(learned: ss.Baseline) -> None:
     for seed in range(30, 36):
         assert (ratios(learned, day(seed)) < 1.0).all()
-    whole, _ = ratios(learned, day(40, FaultEvent("gain_extend", 0.94, 0.0)))
+    whole, _, _ = ratios(learned, day(40, FaultEvent("gain_extend", 0.94, 0.0)))
     assert whole > 1.0
-    _, shift = ratios(learned, day(41, FaultEvent("overlap", 3.5, 15.0)))
+    _, shift, _ = ratios(learned, day(41, FaultEvent("overlap", 3.5, 15.0)))
     assert shift > 1.0
 
 
@@ -105,6 +114,37 @@ def test_halves_scatter_and_few_samples_more(learned: ss.Baseline) -> None:
     np.testing.assert_array_equal(C, np.array(model.halves))
     np.testing.assert_allclose(model.stretch_covariance(0.25 * model.samples), 2.0 * C)
     assert np.linalg.eigvalsh(C / np.outer(*2 * [np.sqrt(np.diag(C))])).min() > 0.05
+
+
+def test_a_fit_of_all_samples_shows_what_the_residual_hides(learned: ss.Baseline) -> None:
+    """A slower spool moves one small coefficient, of which few classes of speed show anything."""
+    plain = learned.loop.to_dict()
+    del plain["columns"]["covariates"]
+    baseline = ss.learn(ss.Loop.from_dict(plain), [day(seed) for seed in range(7)])
+    whole, shift, fit = ratios(baseline, slow := day(45, FaultEvent("valve_hz", 0.5, 0.0)))
+    assert max(whole, shift) < 1.0 < fit
+    diagnosis = ss.diagnose(baseline, slow)
+    assert [fault.name for fault in diagnosis.faults] == ["lag"]
+    assert any("a fit of the coefficients" in str(reason) for reason in diagnosis.reasons)
+    assert all(ratios(baseline, day(seed))[2] < 1.0 for seed in range(30, 34))
+    # what is promised is what a fit shows, and half as much does not
+    changes = {change.name: change.change or np.inf for change in baseline.detectability.changes}
+    for ratio, shows in ((1.0 - 1.5 * changes["valve_forward"], True), (1.0 - 0.5 * changes["valve_forward"], False)):
+        assert (ratios(baseline, day(47, FaultEvent("gain_extend", ratio, 0.0)))[2] > 1.0) == shows
+
+
+def test_a_coefficient_that_rows_do_not_show_counts_nothing(learned: ss.Baseline) -> None:
+    recording = day(46)
+    pipeline, rms = learned.pipeline(), np.array(model_of(learned).rms)
+    still = replace(recording, y=np.minimum(recording.y, 0.05))  # it never reaches the process
+    thetas = [
+        fit_coefficients(pipeline.regression(log.r, log.u, log.y, log.restart), rms) for log in (recording, still)
+    ]
+    assert [int(np.isnan(theta).sum()) for theta in thetas] == [0, 1]
+    left = np.random.default_rng(0).standard_normal((400, 2)) * [1.0, 3.0]
+    left[::2, 1] = np.nan
+    np.testing.assert_allclose(np.sqrt(np.diag(further_covariance(left, 200))), [1.0, 3.0], rtol=0.15)
+    assert mean_t2(np.array([2.0, np.nan]), np.diag([4.0, 1.0])) == pytest.approx(1.0)
 
 
 def test_a_short_recording_is_no_fault(learned: ss.Baseline) -> None:

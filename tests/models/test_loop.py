@@ -256,7 +256,10 @@ def test_a_missing_gain_is_named(rig: dict[str, Any]) -> None:
 
 def test_wrong_coefficients_of_a_polynomial_are_told() -> None:
     plant = {"kind": "polynomial", "order": 2, "coefficients": {"mass": 1.0}}
-    assert refusal({"sample_rate": 100.0, "plant": plant}).startswith("loop.toml: [plant] coefficients: unknown mass")
+    told = refusal({"sample_rate": 100.0, "plant": plant})
+    assert told.startswith(
+        "loop.toml: [plant] coefficients: give each of viscous_friction, inertia; check inertia, mass"
+    )
 
 
 def test_what_is_no_table_is_refused() -> None:

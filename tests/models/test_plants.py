@@ -188,9 +188,9 @@ class TestPolynomial:
     @pytest.mark.parametrize(
         ("coefficients", "message"),
         [
-            ({"inertia": 1.0}, "missing viscous_friction"),
-            ({"inertia": 1.0, "viscous_friction": 1.0, "friction": 2.0}, "unknown friction"),
-            ({"inertia": 0.0, "viscous_friction": 1.0}, "highest power"),
+            ({"inertia": 1.0}, "check viscous_friction"),
+            ({"inertia": 1.0, "viscous_friction": 1.0, "friction": 2.0}, "check friction"),
+            ({"inertia": 0.0, "viscous_friction": 1.0}, "inertia must not be 0"),
             ({"inertia": 1.0, "viscous_friction": -1.0}, "negative"),
         ],
     )

@@ -22,6 +22,7 @@ from typing import Self
 import numpy as np
 
 from servoscope.baseline.records import BaselineModel, Matrix, Vector
+from servoscope.baseline.residual_model import MIN_COLUMN_SHARE
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray
 from servoscope.models.plants.cylinder import CHANNELS
@@ -34,7 +35,6 @@ EQUATIONS = FLOW, FORCE, SUPPLY
 NAMES = (*FLOW, *FORCE, *SUPPLY)
 FILTER_ORDER = 3
 MOVING_SHARE = 0.05  # of the rms speed, from which on the sign of a speed is trusted
-MIN_COLUMN_SHARE = 0.05  # of the rms that a column has when healthy: with less it tells nothing of its coefficient
 # by parameter of the plant, the powers of its ratio with which coefficients go
 EXPONENTS: Mapping[str, Mapping[str, float]] = {
     "supply_pressure": {"supply": 1.0},

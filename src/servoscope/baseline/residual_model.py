@@ -4,23 +4,25 @@ No model is exact: in healthy recordings too, the residual e = eta - phi' theta 
 position and acceleration. This mean is taken out. What is left by classes of speed, its correlation with acceleration
 and position, and its rms scatter between healthy recordings; how far a further recording is from them is T^2/d of
 `GroupStatistic`. The second half of a recording is compared with the first, too: what differs from day to day is in
-both.
+both. Where coefficients of a recording are compared with healthy ones, so are those of all its samples.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
 from pydantic import Field
 
+from servoscope.baseline.covariates import CovariatePath
 from servoscope.baseline.feature_model import FeatureGroup, GroupStatistic, is_near
 from servoscope.baseline.records import BaselineModel, Matrix, Vector
 from servoscope.core import outofcore
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray, to_tuples
-from servoscope.estimation.pipeline import Pipeline, RegressionRunner
+from servoscope.estimation.pipeline import Pipeline, Regression, RegressionRunner
+from servoscope.models.lti import solve_scaled
 from servoscope.signals import Recording
 
 SPEED_SHARES = (0.02, 0.1, 0.4, 0.8)  # of the top speed: the classes of speed in either direction
@@ -28,9 +30,11 @@ CLASSES = 2 * len(SPEED_SHARES) + 1
 POSITIONS = 6  # classes of position
 CORRELATIONS = 4  # with acceleration and position, each by itself and by direction
 SIZE = CLASSES + CORRELATIONS + 1  # number of features
+MIN_SAMPLES_PER_COEFFICIENT = 20  # usable samples that are fitted
 FADE_S = 0.1  # time in a class at which its mean counts half
 SAME_MOTION_RATIO = 1.6  # of rms position, speed and acceleration of r, up to which two recordings move alike
 MIN_SHARE = 1e-4  # of the rms of eta: a smaller difference is no evidence
+MIN_COLUMN_SHARE = 0.05  # of the rms that a column has when healthy: with less it tells nothing of its coefficient
 
 
 class ResidualSamples(NamedTuple):
@@ -148,6 +152,8 @@ class ResidualModel(BaselineModel):
     limits: tuple[float, float] = (1.0, 1.0)  # of T^2/d
     # covariance (n, n) of coefficients fitted to half a recording, about the healthy ones; empty where not compared
     halves: Matrix = Field(default=(), exclude_if=lambda value: not value)
+    rms: Vector = Field(default=(), exclude_if=lambda value: not value)  # of each column when healthy
+    fit_limit: float = Field(default=np.inf, exclude_if=np.isinf)  # of T^2/n of the coefficients of a whole recording
 
     @classmethod
     def of(cls, layout: ResidualLayout, healthy: Sequence[RecordingResidual]) -> Self:
@@ -197,6 +203,48 @@ class ResidualModel(BaselineModel):
         More than half a recording is not surer: what differs from day to day does not average.
         """
         return np.array(self.halves) * max(1.0, 0.5 * self.samples / max(samples, 1.0))
+
+    def deviation_of_rows(
+        self, pipeline: Pipeline, recording: Recording, rows: slice, theta: FloatArray, along: CovariatePath | None
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Return a fit to some rows minus the healthy theta (n,), and how such fits scatter, (n, n).
+
+        NaN where the rows do not show a coefficient; None where they are few, or healthy fits were not compared.
+        """
+        part = recording.rows(rows)
+        g = pipeline.regression(part.r, part.u, part.y, part.restart) if self.halves else None
+        if g is None or (samples := int(g.ok.sum())) < MIN_SAMPLES_PER_COEFFICIENT * len(theta):
+            return None
+        if along is not None:
+            theta = along.expected(np.arange(recording.samples)[rows][g.ok]).mean(axis=0)
+        return fit_coefficients(g, np.array(self.rms or 0.0)) - theta, self.stretch_covariance(samples)
+
+    def detectable_changes(self, directions: Mapping[str, FloatArray], covariance: FloatArray) -> dict[str, float]:
+        """Return the smallest relative changes that leave the limit of the fit, by parameter; infinite: none does.
+
+        `directions`: what a relative change adds to the coefficients, (n,); `covariance`: of the fit, (n, n).
+        """
+        with np.errstate(divide="ignore"):
+            sizes = {
+                name: len(d) * self.fit_limit / (d @ solve_scaled(covariance, d)) for name, d in directions.items()
+            }
+        return {name: float(np.sqrt(size)) for name, size in sizes.items()}
+
+
+def mean_t2(deviation: FloatArray, covariance: FloatArray) -> float:
+    """Return d' C^-1 d/n of the n entries of a deviation that are known: Hotelling's statistic."""
+    known = np.flatnonzero(np.isfinite(deviation))
+    d = deviation[known]
+    return float(d @ solve_scaled(covariance[np.ix_(known, known)], d)) / max(len(known), 1)
+
+
+def fit_coefficients(g: Regression, rms: FloatArray) -> FloatArray:
+    """Return least squares over the usable samples, (n,); NaN where a column is hardly there, by its healthy rms."""
+    phi, z, eta = g.phi[g.ok], g.z[g.ok], g.eta[g.ok]
+    theta = np.full(phi.shape[1], np.nan)
+    known = np.flatnonzero((phi**2).sum(axis=0) > len(phi) * (MIN_COLUMN_SHARE * rms) ** 2)
+    theta[known] = solve_scaled(z[:, known].T @ phi[:, known], z[:, known].T @ eta)
+    return theta
 
 
 def _expected_shift(statistic: GroupStatistic, residual: RecordingResidual) -> FloatArray:

@@ -9,19 +9,17 @@ import numpy as np
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.expectation import Expectation, reference_path
 from servoscope.baseline.pressure_model import PIECE_S
-from servoscope.baseline.residual_model import ResidualModel
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError, RecordingError
 from servoscope.detection.onset import Onset
 from servoscope.diagnosis.pressure_evidence import pressure_inputs
 from servoscope.evidence.examination import Examination
 from servoscope.fit.instrumental_fit import InstrumentalFit, fit_with_instrument
-from servoscope.fit.tuning import fit_tuning, least_squares
+from servoscope.fit.tuning import fit_tuning
 from servoscope.isolation.signature import Signature
 from servoscope.isolation.signatures import fault_signatures
 
 MAX_STRETCH_SAMPLES = 200_000  # of a stretch; more add nothing but memory
-MIN_SAMPLES_PER_COEFFICIENT = 20  # usable samples of a stretch
 HALF_STRETCH_TOLERANCE = 0.05  # stated relative deviation, up to which half a stretch is enough
 
 
@@ -107,8 +105,13 @@ def isolation_inputs(exam: Examination, onset: Onset, at: int) -> tuple[list[Sig
     elif exam.pressures is not None:
         begin = onset.sample // round(PIECE_S * recording.sample_rate)
         return pressure_inputs(exam.pressures, exam.baseline.plant, begin)
-    elif (model := exam.baseline.residual) is not None and model.halves:
-        whole = _deviation_of_stretch(exam, model, onset, last)
+    elif (model := exam.baseline.residual) is not None:
+        begin = onset.sample
+        if last - begin < exam.pipeline.memory_samples:  # such an onset is hardly known: all of its interval counts
+            begin = round((onset.low_s - float(recording.t[0])) * recording.sample_rate)
+        rows, theta = slice(begin, last + 1), np.array(exam.baseline.theta)
+        stretch = model.deviation_of_rows(exam.pipeline, recording, rows, theta, exam.along)
+        whole = stretch if stretch is not None and np.isfinite(stretch[0]).all() else None
     deviation, covariance = whole or recursive
     expectation = exam.expectation(first, last + 1) if exam.noise is not None else None
     recalled = recording.rows(slice(first, last + 1))
@@ -116,26 +119,3 @@ def isolation_inputs(exam: Examination, onset: Onset, at: int) -> tuple[list[Sig
     signatures = fault_signatures(exam.baseline, recalled, expectation, max(onset.sample - first, 0), settled)
     model_error = exam.model_error(slice(at, at + 1))[0]
     return signatures, deviation, covariance + model_error
-
-
-def _deviation_of_stretch(
-    exam: Examination, model: ResidualModel, onset: Onset, last: int
-) -> tuple[FloatArray, FloatArray] | None:
-    """Return theta since an onset minus its healthy expectation, (n,), and how such fits scatter, (n, n).
-
-    An onset that leaves less than a memory is hardly known: all of its interval counts then. None where the samples do
-    not tell the coefficients.
-    """
-    rate = exam.recording.sample_rate
-    first = onset.sample
-    if last - first < exam.pipeline.memory_samples:
-        first = round((onset.low_s - float(exam.recording.t[0])) * rate)
-    rows = slice(first, last + 1)
-    part = exam.recording.rows(rows)
-    g = exam.pipeline.regression(part.r, part.u, part.y, part.restart)
-    if g.ok.sum() < MIN_SAMPLES_PER_COEFFICIENT * g.phi.shape[1] or not g.phi[g.ok].any(axis=0).all():
-        return None
-    expected = np.array(exam.baseline.theta)
-    if exam.along is not None:
-        expected = exam.along.expected(np.arange(first, last + 1)[g.ok]).mean(axis=0)
-    return least_squares(g) - expected, model.stretch_covariance(float(g.ok.sum()))

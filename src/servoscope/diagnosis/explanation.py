@@ -208,7 +208,7 @@ def _alarm_reason(exam: Examination, interval: FaultInterval) -> Message | None:
     if value <= limit:  # then the other tests alone may have raised it
         excess = float(np.nanmax(exam.residual_ratios, initial=0.0))
         if exam.change is None and excess > 1.0:
-            kind = "shift" if exam.residual_ratios[1] == excess else "residual"
+            kind = ("residual", "shift", "fit")[int(np.nanargmax(exam.residual_ratios))]
             return message(f"diagnosis.alarm_{kind}", excess=excess)
         kind = "cusum" if exam.change is None else "change"
         return message(f"diagnosis.alarm_{kind}", t=interval.detected_at_s)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from servoscope.baseline.pressure_model import EXPONENTS, NAMES, PIECE_S, PressureEvidence
+from servoscope.baseline.pressure_model import EQUATIONS, EXPONENTS, NAMES, PIECE_S, PressureEvidence
 from servoscope.core.arrays import FloatArray
 from servoscope.detection.onset import Onset
 from servoscope.isolation.signature import Signature
@@ -15,10 +15,10 @@ from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 
 ONSET_PIECES = 3  # either way, by which an onset may be off
-# by which a fault leaves its curve, in standard deviations of the coefficients [rad]: valves are not as symmetric, and
-# forces not as simple, as the equations
-ANGLES = {"gain_forward": 0.3, "gain_backward": 0.3, "load": 0.3, "process": 0.5}
-ANGLE = 0.05  # of all others: the filters pass on a little of one column's change to others
+# by which a fault leaves its curve, in standard deviations of the coefficients [rad], in its own equation and in the
+# others: valves are not as symmetric, and forces not as simple, as the equations
+ANGLES = {"gain_forward": (0.3, 0.1), "gain_backward": (0.3, 0.1), "load": (0.3, 0.1), "process": (0.35, 0.2)}
+ANGLE = 0.05, 0.05  # of all others: the filters pass on a little of one column's change to others
 
 
 def pressure_onset(pressures: PressureEvidence, recording: Recording) -> Onset:
@@ -43,16 +43,12 @@ def pressure_inputs(
     names = [NAMES[k] for k in known]
     covariance = model.stretch_covariance(float(stretch[-1][0, 0]))[np.ix_(known, known)]
     signatures = power_signatures(plant, EXPONENTS, names, theta[known], np.eye(len(known)))
-    relative = dict(zip(NAMES, (model.std / np.maximum(np.abs(theta), 1e-300)).tolist(), strict=True))
-    return (
-        [
-            replace(
-                signature,
-                angle=ANGLES.get(signature.fault.parameter, ANGLE),
-                healthy_std=max(relative[name] for name in EXPONENTS[signature.fault.parameter]),
-            )
-            for signature in signatures
-        ],
-        deviation[known],
-        covariance,
-    )
+    certainty = dict(zip(NAMES, (theta / model.std).tolist(), strict=True))
+    placed = []
+    for signature in signatures:
+        moved, (own, others) = EXPONENTS[parameter := signature.fault.parameter], ANGLES.get(parameter, ANGLE)
+        equation = next(names for names in EQUATIONS if not moved.keys().isdisjoint(names))
+        angle = np.array([own if name in equation else others for name in names])
+        healthy_std = 1.0 / float(np.linalg.norm([certainty[name] for name in moved]))
+        placed.append(replace(signature, angle=angle, healthy_std=healthy_std))
+    return placed, deviation[known], covariance

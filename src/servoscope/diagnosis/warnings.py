@@ -45,10 +45,12 @@ def detectable_sizes(exam: Examination) -> dict[str, tuple[float, float]]:
         name: float(np.sqrt(needed / bound)) if bound > 0.0 else np.inf
         for name, bound in zip(promised, best, strict=True)
     }
-    if exam.pressures is not None:
-        for name, size in exam.pressures.model.detectable_changes.items():
-            if name in smallest:
-                smallest[name] = min(smallest[name], size)
+    model, fit = baseline.residual, exam.whole_fit
+    judged = [] if exam.pressures is None else [exam.pressures.model.detectable_changes]
+    if model is not None and fit is not None and np.isfinite(fit[0]).all() and np.isfinite(exam.residual_ratios).all():
+        judged.append(model.detectable_changes(baseline.fault_directions, fit[1]))
+    for sizes in judged:
+        smallest = {name: min(size, sizes.get(name, np.inf)) for name, size in smallest.items()}
     if exam.along is not None and exam.along.std is not None:
         for name, per_warmth in changes_like_warmth(exam).items():
             smallest[name] = max(smallest.get(name, 0.0), exam.along.jump * per_warmth)

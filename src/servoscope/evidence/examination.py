@@ -1,8 +1,4 @@
-"""One recording against one baseline: the estimates, what a healthy loop would have shown, and the statistics.
-
-A recording of any length is read once, chunk by chunk; later questions about single evaluations are answered from the
-samples that they have not forgotten.
-"""
+"""One recording against one baseline: the estimates, what a healthy loop would have shown, and the statistics."""
 
 from __future__ import annotations
 
@@ -20,6 +16,7 @@ from servoscope.baseline.covariates import CovariatePath
 from servoscope.baseline.expectation import Expectation, ReferencePath, reference_path, residual_noise_model
 from servoscope.baseline.motion import RecordedMotion
 from servoscope.baseline.pressure_model import PressureEvidence
+from servoscope.baseline.residual_model import mean_t2
 from servoscope.core import outofcore
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import RecordingError
@@ -158,9 +155,20 @@ class Examination:
 
     @cached_property
     def residual_ratios(self) -> FloatArray:
-        """What the healthy coefficients leave of u over its limits, see `ResidualModel.ratios`; NaN: no evidence."""
+        """`ResidualModel.ratios`, and how far a fit is from healthy over its limit, shape (3,); NaN: no evidence."""
         model = None if self.quick else self.baseline.residual
-        return np.full(2, np.nan) if model is None else model.ratios_of(self.pipeline, self.recording)
+        if model is None:
+            return np.full(3, np.nan)
+        ratios, fit = model.ratios_of(self.pipeline, self.recording), self.whole_fit
+        return np.append(ratios, np.nan if fit is None or np.isnan(ratios).all() else mean_t2(*fit) / model.fit_limit)
+
+    @cached_property
+    def whole_fit(self) -> tuple[FloatArray, FloatArray] | None:
+        """`ResidualModel.deviation_of_rows` of all rows; None where nothing was learned or it is `quick`."""
+        if self.quick or (model := self.baseline.residual) is None:
+            return None
+        theta = np.array(self.baseline.theta)
+        return model.deviation_of_rows(self.pipeline, self.recording, slice(None), theta, self.along)
 
     @cached_property
     def pressures(self) -> PressureEvidence | None:

@@ -1,4 +1,7 @@
-"""A step of learning: what the healthy coefficients leave of u, and how much of it a healthy recording may have."""
+"""A step of learning: what the healthy coefficients leave of u, and how much of it a healthy recording may have.
+
+Of plants whose stretches are fitted, how far the coefficients of a healthy recording may be off as well.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +10,20 @@ from collections.abc import Sequence
 import numpy as np
 
 from servoscope.baseline.baseline import Baseline
-from servoscope.baseline.residual_model import POSITIONS, SPEED_SHARES, ResidualLayout, ResidualModel
+from servoscope.baseline.residual_model import (
+    POSITIONS,
+    SPEED_SHARES,
+    ResidualLayout,
+    ResidualModel,
+    fit_coefficients,
+    mean_t2,
+)
 from servoscope.baseline.threshold import score_limit
 from servoscope.core.arrays import FloatArray, to_tuples
 from servoscope.detection.homogeneity import prediction_factor
 from servoscope.estimation.pipeline import Pipeline
 from servoscope.evidence.features import PAST_BUDGET
 from servoscope.evidence.kind import EvidenceKind, HealthyRecordings, Learned
-from servoscope.fit.tuning import least_squares
 from servoscope.signals import Recording
 
 MIN_RECORDINGS = 6  # so that five judge each: fewer do not tell a drift from scatter
@@ -66,25 +75,39 @@ def learn_residuals(healthy: HealthyRecordings, theta: FloatArray) -> ResidualMo
     if len(whole) < MIN_RECORDINGS:
         return None
     limits = score_limit(whole, share), SHIFT_MARGIN * score_limit(shift, PAST_BUDGET * share)
-    halves = to_tuples(_half_covariance(healthy, theta)) if healthy.loop.plant.fits_stretches else ()
-    return _learn_model(layout, pipeline, recordings).model_copy(update={"limits": limits, "halves": halves})
+    fits = _learn_fits(healthy, theta, share) if healthy.loop.plant.fits_stretches else {}
+    return _learn_model(layout, pipeline, recordings).model_copy(update={"limits": limits, **fits})
 
 
-def _half_covariance(healthy: HealthyRecordings, theta: FloatArray) -> FloatArray:
-    """Return the covariance (n, n) of a further fit to half a recording, about coefficients theta (n,)."""
-    halves = [half for g in healthy.regressions for half in g.halves if half.ok.sum() > len(theta)]
-    left = np.array([least_squares(half) for half in halves]) - theta
-    return further_covariance(left, len(healthy.recordings))
+def _learn_fits(healthy: HealthyRecordings, theta: FloatArray, share: float) -> dict[str, object]:
+    """Return how fits to halves of recordings scatter about theta (n,), and a limit from each recording left out."""
+    regressions, m = healthy.regressions, len(healthy.regressions)
+    rms = np.sqrt(np.mean([(g.phi[g.ok] ** 2).mean(axis=0) for g in regressions], axis=0))
+    halves = np.array([[fit_coefficients(half, rms) for half in g.halves] for g in regressions]) - theta
+    fits = {"halves": to_tuples(further_covariance(halves, m)), "rms": tuple(rms.tolist())}
+    if healthy.covariates is not None:  # how they move coefficients is fitted to the same few recordings
+        return fits
+    # theta without a recording is off by as much more from it
+    whole = (np.array([fit_coefficients(g, rms) for g in regressions]) - theta) * m / (m - 1.0)
+    others = (further_covariance(np.delete(halves, i, axis=0), m - 1) for i in range(m))
+    scores = [mean_t2(deviation, C) for deviation, C in zip(whole, others, strict=True)]
+    return {**fits, "fit_limit": score_limit(scores, share)}
 
 
 def further_covariance(left: FloatArray, recordings: int) -> FloatArray:
-    """Return the covariance (n, n) of a further fit from what fits of so many recordings are off by, shape (m, n).
+    """Return the covariance (n, n) of a further fit from what fits of so many recordings are off by, shape (..., n).
 
     Of few fits, correlations count the less, as if as many fits without any as there are coefficients had been seen.
+    NaN: not known of that fit; a coefficient of which no fit knows is taken to be sure within 1.
     """
-    size, n = np.sqrt((left**2).mean(axis=0)), left.shape[1]
-    correlations = left.T @ left / np.outer(size, size) + n * np.eye(n)
-    return np.asarray(prediction_factor(recordings) * correlations / (len(left) + n) * np.outer(size, size))
+    left = left.reshape(-1, left.shape[-1])
+    known = np.isfinite(left)
+    left, n = np.where(known, left, 0.0), left.shape[1]
+    counts = 1.0 * known.T @ known
+    size = np.sqrt((left**2).sum(axis=0) / counts.diagonal().clip(1.0))
+    size[~known.any(axis=0)] = 1.0
+    correlations = (left.T @ left / np.outer(size, size) + n * np.eye(n)) / (counts + n)
+    return np.asarray(prediction_factor(recordings) * correlations * np.outer(size, size))
 
 
 def _learn_model(layout: ResidualLayout, pipeline: Pipeline, recordings: Sequence[Recording]) -> ResidualModel:
@@ -95,13 +118,11 @@ def _learn_model(layout: ResidualLayout, pipeline: Pipeline, recordings: Sequenc
 def _left_out_ratios(layout: ResidualLayout, healthy: HealthyRecordings) -> FloatArray:
     """Return the ratios of each recording, shape (n, 2), by means and scatter of recordings that do not hold it."""
     recordings, pipeline = healthy.recordings, healthy.pipeline
-    fold = np.arange(len(recordings)) % MAX_FOLDS
-    ratios = np.empty((len(recordings), 2))
-    for k in range(min(MAX_FOLDS, len(recordings))):
-        model = _learn_model(layout, pipeline, [rec for rec, own in zip(recordings, fold, strict=True) if own != k])
-        for i in np.flatnonzero(fold == k).tolist():
-            ratios[i] = model.ratios_of(pipeline, recordings[i])
-    return ratios
+    models = [
+        _learn_model(layout, pipeline, [rec for i, rec in enumerate(recordings) if i % MAX_FOLDS != k])
+        for k in range(min(MAX_FOLDS, len(recordings)))
+    ]
+    return np.array([models[i % MAX_FOLDS].ratios_of(pipeline, rec) for i, rec in enumerate(recordings)])
 
 
 RESIDUAL = EvidenceKind("residual", _learn)

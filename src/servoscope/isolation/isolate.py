@@ -125,8 +125,9 @@ class _SignatureSearch:
         return J, float(np.linalg.slogdet(Sigma)[1])
 
     def _covariance(self, x: float, s: FloatArray) -> FloatArray:
-        off = (SYSTEMATIC_ERROR_SHARE * s) ** 2 + self.signature.angle**2 * (s @ s) + 1e-12
-        Sigma = self.correlation + np.diag(off)
+        # an angle is off the curve: along it the size is free as it is
+        angle, off = self.signature.angle * np.ones_like(s), (SYSTEMATIC_ERROR_SHARE * s) ** 2 + 1e-12
+        Sigma = self.correlation + np.diag(angle**2 * (s @ s) + off) - np.outer(angle * s, angle * s)
         if self.signature.scatter is not None:
             Sigma = Sigma + self.signature.scatter(x) / np.outer(self.size, self.size)
         return np.asarray(Sigma)

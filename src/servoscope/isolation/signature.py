@@ -25,8 +25,8 @@ class Signature:
     healthy_std: float = (
         0.0  # standard deviation of the healthy value on the coordinate's scale: the size is relative to it
     )
-    # angle by which the curve may be off, in standard deviations of the coefficients [rad]
-    angle: float = 0.0
+    # angle by which the curve may be off, in standard deviations of the coefficients [rad], or of each of them (n,)
+    angle: float | FloatArray = 0.0
     # coordinate -> covariance of the shift, shape (n, n), where the direction itself was learned from recordings
     scatter: Callable[[float], FloatArray] | None = None
 

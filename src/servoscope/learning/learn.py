@@ -189,19 +189,19 @@ def _assemble_baseline(
 
 
 def _with_pressures(baseline: Baseline, healthy: HealthyRecordings) -> Baseline:
-    """Learn the pressures where they are logged; a change that they show is promised, however small for the others."""
-    model = learn_pressures(healthy)
+    """Learn the pressures where they are logged, and promise what they or a fit to whole recordings detect."""
+    model, residual = learn_pressures(healthy), baseline.residual
+    notes, sizes = baseline.notes, [] if model is None else [model.detectable_changes]
     if model is None and healthy.loop.plant.channels:
-        note = message("learning.no_pressures", needed=MIN_RECORDINGS_OF_RESIDUAL)
-        return baseline.model_copy(update={"notes": (*baseline.notes, note)})
-    if model is None:
-        return baseline
-    own, promised = model.detectable_changes, []
+        notes = (*notes, message("learning.no_pressures", needed=MIN_RECORDINGS_OF_RESIDUAL))
+    if residual is not None and residual.halves:
+        sizes.append(residual.detectable_changes(baseline.fault_directions, np.array(residual.halves)))
+    changes = []
     for change in baseline.detectability.changes:
-        smallest = min(change.change or np.inf, own.get(change.parameter, np.inf))
-        promised.append(change.model_copy(update={"change": smallest if np.isfinite(smallest) else None}))
-    detectability = baseline.detectability.model_copy(update={"changes": tuple(promised)})
-    return baseline.model_copy(update={"pressures": model, "detectability": detectability})
+        known = [change.change or np.inf, *(own.get(change.parameter, np.inf) for own in sizes)]
+        changes.append(change.model_copy(update={"change": min(filter(np.isfinite, known), default=None)}))
+    detectability = baseline.detectability.model_copy(update={"changes": tuple(changes)})
+    return baseline.model_copy(update={"pressures": model, "detectability": detectability, "notes": notes})
 
 
 def _carry_features(baseline: Baseline, before: Baseline | None) -> Baseline:

@@ -46,15 +46,13 @@ def _model(layout: PressureLayout, sums: Sequence[Sums]) -> PressureModel:
     known = ~np.isnan(parts)
     never = ~known.any(axis=(0, 1))  # no recording asks for it, and none will be judged by it
     theta = np.where(known, parts, 0.0).sum(axis=(0, 1)) / np.maximum(known.sum(axis=(0, 1)), 1)
-    factor = prediction_factor(len(sums))
-    left = np.where(known, parts - theta, 1.0 * never).reshape(-1, parts.shape[-1])
     both = known.all(axis=1)
     moved = np.where(both, parts[:, 1] - parts[:, 0], 1.0 * never)
-    shifts = np.sqrt(factor * (moved**2).sum(axis=0) / np.maximum(both.sum(axis=0), 1))
+    shifts = np.sqrt(prediction_factor(len(sums)) * (moved**2).sum(axis=0) / np.maximum(both.sum(axis=0), 1))
     return PressureModel(
         layout=layout,
         theta=tuple(theta.tolist()),
-        halves=to_tuples(further_covariance(left, len(sums))),
+        halves=to_tuples(further_covariance(parts - theta, len(sums))),
         shifts=tuple(shifts.tolist()),
         rows=float(np.mean([blocks[-1][:, 0, 0].sum() for blocks in sums])),
     )

@@ -85,28 +85,15 @@ class CylinderRig:
     noise_y: float = 4e-6  # m
     substeps: int = 40
 
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not np.isfinite(value):
-                raise SimulationError(f"cylinder rig: {name} = {value:g} must be finite")
-        if min(self.area_a, self.area_b, self.stroke, self.mass, self.sample_rate, self.substeps) <= 0.0:
-            raise SimulationError("cylinder rig: areas, stroke, mass, sample_rate and substeps must be positive")
-
 
 @dataclass(frozen=True, eq=False)
 class CylinderTruth:
     """What no recording contains; arrays of shape (N,)."""
 
-    y_true: FloatArray  # m
     drive: FloatArray  # of the valve, as a share of its full stroke, from each sample to the next
-    p_a: FloatArray  # Pa
-    p_b: FloatArray
-    p_s: FloatArray
-    spool: FloatArray  # share of its full stroke
-    temperature: FloatArray  # degC
-    states: FloatArray  # (N, 8): y, y', p_A, p_B, spool, spool', bristle, p_S
+    # (N, 8): y [m], y', p_A [Pa], p_B, spool as a share of its full stroke, spool', bristle, p_S
+    states: FloatArray
     laws: FloatArray  # (N, 12): `PARAMETERS` with faults and temperature, in the units of the rig
-    faults: tuple[FaultEvent, ...]
 
 
 PARAMETERS = (
@@ -216,10 +203,8 @@ def simulate_cylinder(
     numbers, names = tuple(map(float, vars(rig).values())), tuple(vars(rig))
     run_cylinder(numbers, laws, whole, feed, noise, begin, u, acting, y, states, names=names, parameters=PARAMETERS)
     if not np.isfinite(states).all():
-        raise SimulationError("cylinder rig: the integration left all bounds, raise substeps")
+        raise SimulationError("cylinder rig: the integration left all bounds, check its numbers or raise substeps")
     used = slice(settling, None)
-    first = np.zeros(r.size, dtype=bool)
-    first[0] = True
     channels = dict(zip(("p_A", "p_B", "p_S"), states[used, [2, 3, 7]].T.copy(), strict=True))
     recording = Recording(
         name="cylinder simulated",
@@ -228,23 +213,15 @@ def simulate_cylinder(
         u=u[used],
         y=y[used],
         sample_rate=rig.sample_rate,
-        restart=first,
+        restart=np.arange(r.size) == 0,
         run=np.zeros(r.size, dtype=np.int32),
         channels={**channels, "T_oil": temperature[used]},
     )
-    truth = CylinderTruth(
-        y_true=states[used, 0],
+    return recording, CylinderTruth(
         drive=acting[used],
-        p_a=channels["p_A"],
-        p_b=channels["p_B"],
-        p_s=channels["p_S"],
-        spool=states[used, 4],
-        temperature=temperature[used],
         states=states[used],
         laws=laws[used],
-        faults=tuple(faults),
     )
-    return recording, truth
 
 
 def _forces(rig: CylinderRig, r: FloatArray, rng: np.random.Generator) -> FloatArray:

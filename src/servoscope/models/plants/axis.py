@@ -145,19 +145,12 @@ class AxisPlant(TermPlant):
             raise ValueError("terms: load_friction grows with the load of gravity, add gravity")
         if self.payload_mass is not None and not self._lifts:
             raise ValueError("payload_mass: needs payload_arm and the term gravity, which tells what it weighs")
-        if self.coefficients is not None:
-            unknown = sorted(set(self.coefficients) ^ set(self.names))
-            if unknown:
-                raise ValueError(f"coefficients: give each of {', '.join(self.names)}; check {', '.join(unknown)}")
-            signed = {column.coefficient for column in self.columns if column.signed}
-            wrong = [name for name, value in self.coefficients.items() if value < 0.0 and name not in signed]
-            if wrong or not self.coefficients["inertia"]:
-                raise ValueError(f"coefficients: {(wrong or ['inertia'])[0]} must be positive")
-            if self._lifts and not self.coefficients["gravity"]:
-                raise ValueError(
-                    "coefficients: gravity must not be 0 beside payload_arm, its sign says where a payload pulls"
-                )
         return self
+
+    @property
+    def leading(self) -> tuple[str, ...]:
+        """The inertia; beside a payload gravity too, whose sign says where it pulls."""
+        return ("inertia", *(("gravity",) if self._lifts else ()))
 
     @property
     def columns(self) -> tuple[TermColumn, ...]:

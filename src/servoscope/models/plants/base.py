@@ -14,7 +14,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import LoopError
-from servoscope.models.plants.columns import Column
+from servoscope.models.plants.columns import COLUMN_UNITS, Column
 
 StateSpace = tuple[FloatArray, FloatArray, FloatArray]
 
@@ -181,7 +181,7 @@ class Plant(BaseModel, abc.ABC):
     def coefficient_units(self) -> tuple[str, ...]:
         """Units of the n coefficients, in u and y themselves where theirs are not known."""
         of_y, of_u = self.units[0] or "y", self.units[1] or ("u" if self.input_gain == 1.0 else "input_gain u")
-        extra = [f"{of_u} s/{of_y}" if name in (Column.FORWARD, Column.BACKWARD) else of_u for name in self.extras]
+        extra = [f"{of_u}{COLUMN_UNITS.get(column, '').replace('y', of_y)}" for column in self.extras]
         return (*(f"{of_u}{('', ' s', ' s²', ' s³', ' s⁴')[power]}/{of_y}" for power in self.powers), *extra)
 
     @property

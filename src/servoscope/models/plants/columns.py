@@ -24,10 +24,17 @@ class Column(StrEnum):
     COGGING_SIN = "cogging_sin"  # the same
     COGGING_COS = "cogging_cos"  # the same
     LOAD = "load_v"  # |sin(factor y + phase)| sign(y')
-    SPEED = "abs_v"  # |y'|
     SPEED_POSITION = "abs_v_y"  # |y'| y
     SPEED_BEYOND = "abs_v_beyond"  # |y'| where y is beyond the factor, 0 elsewhere
     SPEED_SQUARED = "v_abs_v"  # y' |y'|
+
+
+# what a coefficient has besides the unit of u, where it is not that of u
+COLUMN_UNITS = {
+    **dict.fromkeys((Column.FORWARD, Column.BACKWARD, Column.SPEED_BEYOND), " s/y"),
+    Column.SPEED_POSITION: " s/y²",
+    Column.SPEED_SQUARED: " s²/y²",
+}
 
 
 class ColumnForm(NamedTuple):
@@ -66,7 +73,6 @@ COLUMN_FORMS = {
         lambda y, v, a, b: np.abs(np.sin(a * y + b)) * np.sign(v),
         True,
     ),
-    Column.SPEED: ColumnForm(lambda y, v, dead: abs(v), lambda y, v: np.abs(v)),
     Column.SPEED_POSITION: ColumnForm(lambda y, v, dead: abs(v) * y, lambda y, v: np.abs(v) * y),
     Column.SPEED_BEYOND: ColumnForm(
         lambda y, v, dead, a, b: where(y > a, abs(v), 0.0),

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from servoscope.models.plants.base import Fault, read_translations
 from servoscope.models.plants.columns import Column
@@ -37,7 +37,6 @@ CHECKS = {
 }
 
 FrictionKind = Literal["none", "coulomb", "directional"]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class PolynomialPlant(TermPlant):
@@ -53,27 +52,9 @@ class PolynomialPlant(TermPlant):
     friction: FrictionKind = "none"
     offset: bool = False  # whether a constant is added, for example gravity or a biased amplifier
 
-    @model_validator(mode="after")
-    def _coefficients_fit(self) -> Self:
-        if self.coefficients is None:
-            return self
-        unknown = [name for name in self.coefficients if name not in self.names]
-        missing = [name for name in self.names if name not in self.coefficients]
-        if unknown or missing:
-            told = [
-                f"{word} {', '.join(names)}" for word, names in (("unknown", unknown), ("missing", missing)) if names
-            ]
-            raise ValueError(f"coefficients: {'; '.join(told)} (this plant has {', '.join(self.names)})")
-        for name, value in self.coefficients.items():
-            if name != "offset" and value < 0.0:
-                raise ValueError(f"coefficients: {name} = {value:g} must not be negative")
-        for name in self._leading:
-            if self.coefficients[name] == 0.0:
-                raise ValueError(f"coefficients: {name} is the highest power and must not be 0")
-        return self
-
     @property
-    def _leading(self) -> tuple[str, ...]:
+    def leading(self) -> tuple[str, ...]:
+        """The highest power; it may be that of the velocity by direction."""
         if self.order == 1 and self.friction == "directional":
             return EXTRA_NAMES[Column.FORWARD], EXTRA_NAMES[Column.BACKWARD]
         return (POWER_NAMES[self.order],)
@@ -88,7 +69,7 @@ class PolynomialPlant(TermPlant):
         powers = [p for p in range(first, self.order + 1) if p != 1 or self.friction != "directional"]
         extras = (*FRICTION_COLUMNS[self.friction], *((Column.CONSTANT,) if self.offset else ()))
         named = [TermColumn(POWER_NAMES[power], power, 1) for power in powers]
-        return *named, *(TermColumn(EXTRA_NAMES[extra], extra) for extra in extras)
+        return *named, *(TermColumn(EXTRA_NAMES[extra], extra, signed=extra is Column.CONSTANT) for extra in extras)
 
     @property
     def unwatched(self) -> tuple[str, ...]:

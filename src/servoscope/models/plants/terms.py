@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import LoopError
@@ -61,6 +61,24 @@ class TermPlant(Plant):
     sign_cutoff: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = SIGN_CUTOFF
     # nominal values by name, all of `names`; `learn` needs none
     coefficients: dict[str, Annotated[float, Field(allow_inf_nan=False)]] | None = None
+
+    @model_validator(mode="after")
+    def _coefficients_fit(self) -> Self:
+        if self.coefficients is None:
+            return self
+        if wrong := sorted(set(self.coefficients) ^ set(self.names)):
+            raise ValueError(f"coefficients: give each of {', '.join(self.names)}; check {', '.join(wrong)}")
+        positive = {column.coefficient for column in self.columns if not column.signed}
+        if negative := [name for name, value in self.coefficients.items() if value < 0.0 and name in positive]:
+            raise ValueError(f"coefficients: {negative[0]} must not be negative")
+        if zero := [name for name in self.leading if not self.coefficients[name]]:
+            raise ValueError(f"coefficients: {zero[0]} must not be 0")
+        return self
+
+    @property
+    def leading(self) -> tuple[str, ...]:
+        """Coefficients that may not be 0."""
+        return ()
 
     @property
     def has_physics(self) -> bool:
