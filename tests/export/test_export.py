@@ -326,6 +326,11 @@ class TestRefusals:
         with pytest.raises(BaselineError, match=r"features cannot be exported.*= 0, or give --only-coef"):
             export_c(with_features())
 
+    def test_pressures(self) -> None:
+        """Those of a cylinder show what its coefficients do not: an export must not drop them unasked."""
+        with pytest.raises(BaselineError, match=r"pressures cannot be exported: give --only-coef"):
+            export_c(demo().model_copy(update={"pressures": object()}))
+
     def test_operating_points(self) -> None:
         other = demo().model_copy(update={"point": "warm"})
         with pytest.raises(BaselineError, match="--point cold"):

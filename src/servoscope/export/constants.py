@@ -77,6 +77,10 @@ class ExportConstants:
                 f"{loop.name}: features cannot be exported: learn a baseline with "
                 "[monitor] feature_false_alarms = 0, or give --only-coefficients"
             )
+        if baseline.pressures is not None and not only_coefficients:
+            raise BaselineError(
+                f"{loop.name}: logged pressures cannot be exported: give --only-coefficients for T^2 alone"
+            )
         derived = MonitorConstants.from_baseline(baseline)
         if only_coefficients:
             derived = replace(derived, constants=derived.constants._replace(watch=None))
