@@ -26,6 +26,7 @@ RESULTS = {
     "accuracy/delay": ("benchmarks/accuracy/results/delay/*.json", "numbers"),
     "accuracy/reliability": ("benchmarks/accuracy/results/isolation/**/*.json", "numbers"),
     "benchmarks": ("benchmarks/figures/overview.json", "tables"),
+    "cylinder": ("benchmarks/figures/cylinder-plants.json", "tables"),
     "nonlinear-rig": ("benchmarks/figures/nonlinear.json", "tables"),
     "paper/": ("benchmarks/PAPER.md", ""),
 }
