@@ -25,6 +25,7 @@ ROWS_PER_PERIOD = 40.0  # of the cutoff, beyond which neighbouring rows repeat e
 BLOCK_S = 1.0  # of which the squared residuals are counted as one
 MIN_GAIN = 0.03  # share of what is left of u that one more coefficient has to take away
 MIN_SHARE = 2e-5  # and of u
+MIN_TURNED_SHARE = 0.98  # of u, explained by a machine whose u counts the other way; level loops explain 0.95
 # share of u that each of these has to explain: they imitate what a sign that comes late leaves of friction
 IMITATORS = {"stiffness": 0.005, "stribeck": 0.005, "order 3": 0.005}
 MIN_SINE_RANGE_RAD = 0.5  # half of the range of y [rad], from which a sine differs from a straight line
@@ -46,6 +47,7 @@ class PlantCandidate:
     squares: FloatArray  # of the residual over the variance of u, by block
     coefficients: int
     plausible: bool  # whether inertia and frictions are positive, as far as the plant has them
+    reversed: bool  # whether all of these are negative: u counts the other way
 
     @property
     def worth(self) -> float:
@@ -125,13 +127,19 @@ def choose_plant(
     plausible = [candidate for candidate in candidates if candidate.plausible]
     if not plausible:
         raise NotEnoughError("it moves too little to compare plants: record a longer motion, or more excitation")
-    best = max(plausible, key=lambda candidate: candidate.worth)
-    supported = min(
-        (candidate for candidate in plausible if _is_as_good(candidate, best)),
-        key=lambda candidate: (*_simplicity(candidate, swings), -candidate.worth),
-    )
+    supported = _support(plausible, swings)
+    if "terms" not in supported.settings:  # perhaps because u counts the other way
+        turned = [other for other in candidates if other.reversed and other.explained >= MIN_TURNED_SHARE]
+        supported = _support([*plausible, *turned], swings)
     others = sorted(candidates, key=lambda candidate: -candidate.explained)
     return supported, *(candidate for candidate in others if candidate is not supported)
+
+
+def _support(candidates: Sequence[PlantCandidate], swings: bool) -> PlantCandidate:
+    """Return the simplest of the plants that are as good as the best."""
+    best = max(candidates, key=lambda candidate: candidate.worth)
+    as_good = (candidate for candidate in candidates if _is_as_good(candidate, best))
+    return min(as_good, key=lambda candidate: (*_simplicity(candidate, swings), -candidate.worth))
 
 
 def _is_as_good(candidate: PlantCandidate, best: PlantCandidate) -> bool:
@@ -245,8 +253,10 @@ def _judge(settings: dict[str, object], names: tuple[str, ...], folds: Sequence[
         *cylinder.TERMS.values(),
     ]
     signed = {column.coefficient for column in every if column.signed}
-    plausible = "terms" not in settings or all(value > 0.0 for name, value in theta.items() if name not in signed)
-    return PlantCandidate(settings, 1.0 - float(together.sum()), together, len(names), plausible)
+    positive = {value > 0.0 for name, value in theta.items() if name not in signed}
+    has_terms = "terms" in settings
+    plausible, reverse = not has_terms or positive == {True}, has_terms and positive == {False}
+    return PlantCandidate(settings, 1.0 - float(together.sum()), together, len(names), plausible, reverse)
 
 
 def _cut(g: model_order.Regressors, used: BoolArray, cutoff: float, recordings: int) -> Iterator[_Fold]:

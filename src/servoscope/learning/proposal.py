@@ -173,6 +173,8 @@ def propose_loop(paths: Sequence[Path], columns: Columns, where: Mapping[str, st
         candidates = choose_plant(recordings, cutoff, is_speed, inspection.rest.speed)
     except NotEnoughError as error:
         raise RecordingError(f"{path}: {error}") from None
+    if candidates[0].reversed and not re.search(r" [+-] |^-", columns.input):
+        return propose_loop(paths, _turned(columns), where)
     chosen = _with_pressures(candidates[0], path, columns)
     loop = loop_of(chosen.settings)
     held = []
@@ -219,6 +221,12 @@ def _inspect(recording: Recording, is_speed: bool) -> Inspection:
     if not is_speed:
         return inspect(recording)
     return inspect(recording, Loop.from_dict({"sample_rate": recording.sample_rate, "plant": SPEED_AXIS}))
+
+
+def _turned(columns: Columns) -> Columns:
+    """Return columns with the other sign of u."""
+    text = columns.input if "`" in columns.input else quoted_channel(columns.input)
+    return columns.model_copy(update={"input": f"-{text}" if "* " in text else f"-1 * {text}"})
 
 
 def _with_pressures(chosen: PlantCandidate, path: Path, columns: Columns) -> PlantCandidate:
@@ -373,6 +381,8 @@ def _column_lines(path: Path, columns: Columns, wraps: Mapping[str, float], reco
         doubtful = (not unit and key == "output") or key in wraps
         if key == "reference" and without:
             why, doubtful = message("init.no_reference"), True
+        elif key == "input" and texts[0].startswith("-"):
+            why, doubtful = message("init.turned"), True
         elif key == "reference" and not 1.0 / MAX_SPAN_RATIO < spans[0] / (spans[1] or math.inf) < MAX_SPAN_RATIO:
             why, doubtful = message("init.reference_unit", r=spans[0], y=spans[1]), True
         lines.append(ProposalLine("columns", key, value, why, doubtful))
