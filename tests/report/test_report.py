@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
-import time
 from pathlib import Path
 from typing import Any
 
@@ -222,12 +221,9 @@ def test_a_coefficient_that_should_be_zero_is_drawn_in_its_own_units() -> None:
     ]
 
 
-def test_long_recordings_are_drawn_fast_and_small(loop: Loop, tmp_path: Path) -> None:
+def test_pages_of_long_recordings_are_small(loop: Loop, tmp_path: Path) -> None:
     recording, trace, diagnosis = make_recording(1_000_000), make_trace(100_000), make_diagnosis()
-    report.write_diagnosis_page(tmp_path / "warm.html", diagnosis, make_trace(10), make_recording(50), loop, {})
-    begin = time.perf_counter()
     report.write_diagnosis_page(tmp_path / "long.html", diagnosis, trace, recording, loop, PROVENANCE)
-    assert time.perf_counter() - begin < 8.0  # about one and a half alone on a machine
     assert (tmp_path / "long.html").stat().st_size < 3_000_000
 
 
