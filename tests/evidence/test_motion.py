@@ -106,6 +106,7 @@ def test_a_fault_beyond_what_the_model_may_be_off_is_still_found() -> None:
     widths = {words: size.interval[1] - size.interval[0] for words, size in sizes.items()}
     assert widths["random"] > 2.0 * widths["moves"]
     assert [warning.kind for warning in fault["random"].warnings].count("motion") == 1
+    assert all(warning.kind != "motion" for warning in fault["moves"].warnings)
 
 
 @pytest.mark.parametrize("amplitude", [0.4, 0.7, 1.3, 1.6])
