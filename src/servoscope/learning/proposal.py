@@ -36,6 +36,7 @@ from servoscope.signals.readers.guess_columns import (
     names_speed,
     names_target_torque,
     quoted_channel,
+    turned_channel,
 )
 from servoscope.signals.readers.select import RowFilter
 from servoscope.signals.readers.table import TableFile, number_column, read_part
@@ -174,7 +175,7 @@ def propose_loop(paths: Sequence[Path], columns: Columns, where: Mapping[str, st
     except NotEnoughError as error:
         raise RecordingError(f"{path}: {error}") from None
     if candidates[0].reversed and not re.search(r" [+-] |^-", columns.input):
-        return propose_loop(paths, _turned(columns), where)
+        return propose_loop(paths, columns.model_copy(update={"input": turned_channel(columns.input)}), where)
     chosen = _with_pressures(candidates[0], path, columns)
     loop = loop_of(chosen.settings)
     held = []
@@ -221,12 +222,6 @@ def _inspect(recording: Recording, is_speed: bool) -> Inspection:
     if not is_speed:
         return inspect(recording)
     return inspect(recording, Loop.from_dict({"sample_rate": recording.sample_rate, "plant": SPEED_AXIS}))
-
-
-def _turned(columns: Columns) -> Columns:
-    """Return columns with the other sign of u."""
-    text = columns.input if "`" in columns.input else quoted_channel(columns.input)
-    return columns.model_copy(update={"input": f"-{text}" if "* " in text else f"-1 * {text}"})
 
 
 def _with_pressures(chosen: PlantCandidate, path: Path, columns: Columns) -> PlantCandidate:

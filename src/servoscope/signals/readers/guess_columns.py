@@ -270,6 +270,12 @@ def scaled_channel(column: str, quoted: bool = False) -> str:
     return f"{factor:.15g} * {quoted_channel(column)}"
 
 
+def turned_channel(text: str) -> str:
+    """Return a column, or a multiple of one, times -1."""
+    text = text if "`" in text else quoted_channel(text)
+    return f"-{text}" if "* " in text else f"-1 * {text}"
+
+
 def quoted_channel(column: str) -> str:
     """Return a column's name, in backticks unless it is one plain word."""
     return column if column.isidentifier() else f"`{column}`"
