@@ -55,10 +55,15 @@ NAMES: dict[str, set[str]] = {
 
 def loop(words: str) -> ss.Loop:
     """Return the loop file of one of `PLANTS`."""
-    monitor = {"cutoff": CUTOFF_HZ, "memory": MEMORY_S, "frequencies": [0.5, 2.0]}
-    loop = {"name": "cylinder", "sample_rate": RATE, "plant": PLANTS[words], "monitor": monitor}
     columns = {"covariates": {"T_oil": "T_oil"}} if "temperature" in words else {}
-    return ss.Loop.from_dict({**loop, "columns": columns})
+    return loop_with(PLANTS[words], columns)
+
+
+def loop_with(plant: dict[str, object], columns: dict[str, object] | None = None) -> ss.Loop:
+    """Return the loop file with a table ``[plant]`` of its own."""
+    monitor = {"cutoff": CUTOFF_HZ, "memory": MEMORY_S, "frequencies": [0.5, 2.0]}
+    loop = {"name": "cylinder", "sample_rate": RATE, "plant": plant, "monitor": monitor}
+    return ss.Loop.from_dict({**loop, "columns": columns or {}})
 
 
 def rows(

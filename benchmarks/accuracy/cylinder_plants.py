@@ -14,7 +14,7 @@ import numpy as np
 from tables import Table, parser, show
 
 import servoscope as ss
-from accuracy.cylinder import CUTOFF_HZ, CYLINDER, MEMORY_S
+from accuracy.cylinder import CYLINDER, loop_with
 from accuracy.cylinder_days import RATE, day, learned_days
 from servoscope.core.arrays import FloatArray
 from servoscope.simulation import CylinderRig
@@ -22,19 +22,11 @@ from servoscope.simulation import CylinderRig
 SEED = 70000
 BITS = 12
 REST_SHARE = 0.02  # of the largest speed, below which the piston rests
-CONTACT_M = 0.06  # where the process force begins
 PICTURE_S = (10.0, 25.0)
 PLANTS: dict[str, dict[str, object]] = {
     "linear plant": {"kind": "polynomial", "order": 3},
     "columns": CYLINDER,
 }
-
-
-def learn(plant: dict[str, object], healthy: list[ss.Recording]) -> ss.Baseline:
-    """Return the baseline of a plant."""
-    monitor = {"cutoff": CUTOFF_HZ, "memory": MEMORY_S, "frequencies": [0.5, 2.0]}
-    loop = {"name": "cylinder", "sample_rate": RATE, "plant": plant, "monitor": monitor}
-    return ss.learn(ss.Loop.from_dict(loop), healthy, force=True)  # of the linear plant the inertia is negative
 
 
 def inputs(baseline: ss.Baseline, recording: ss.Recording) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -49,8 +41,8 @@ def phases(baseline: ss.Baseline, recording: ss.Recording) -> dict[str, FloatArr
     speed = baseline.pipeline().kinematics.regression(y, y, y, recording.restart).phi[:, 1]
     slow = REST_SHARE * np.abs(speed).max()
     return {
-        "extends": (speed > slow) & (y < CONTACT_M),
-        "presses": (speed > slow) & (y >= CONTACT_M),
+        "extends": (speed > slow) & (y < CylinderRig.contact),
+        "presses": (speed > slow) & (y >= CylinderRig.contact),
         "retracts": speed < -slow,
         "rests": np.abs(speed) <= slow,
         "all": np.ones(len(y), dtype=np.bool_),
@@ -63,7 +55,8 @@ def main() -> None:
     command.add_argument("--picture", type=Path, help="draw u beside what each plant makes of y")
     given = command.parse_args()
     healthy, recording = learned_days(first=SEED), day("production", SEED + 100)
-    baselines = {name: learn(plant, healthy) for name, plant in PLANTS.items()}
+    # of the linear plant the inertia is negative
+    baselines = {name: ss.learn(loop_with(plant), healthy, force=True) for name, plant in PLANTS.items()}
     explained = {name: inputs(baseline, recording) for name, baseline in baselines.items()}
     known = np.logical_and.reduce([ok for _, _, ok in explained.values()])
     u = explained["columns"][0]

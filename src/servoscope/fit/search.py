@@ -153,17 +153,16 @@ def fit(
     return at
 
 
-def raise_unknown(fitted: Fit, i: int, highest: float, bisections: int) -> Fit:
-    """Return a fit with an unknown as large as its likelihood allows, the others as they are."""
-    largest, x = fitted, fitted.x.copy()
+def raise_unknown(
+    cost: Callable[[FloatArray], float], likely: FloatArray, i: int, highest: float, bisections: int
+) -> FloatArray:
+    """Return unknowns (m,) of which one is as large as the likelihood allows; `cost`: minus its logarithm."""
+    x, low, limit = likely.copy(), float(likely[i]), cost(likely) + LIKELIHOOD_DROP
     for _ in range(bisections):
-        x[i] = 0.5 * (largest.x[i] + highest)
-        middle = fitted.experiment.at(x.copy(), fitted.free)
-        if middle.cost < fitted.cost + 2.0 * LIKELIHOOD_DROP:
-            largest = middle
-        else:
-            highest = float(x[i])
-    return largest
+        x[i] = 0.5 * (low + highest)
+        low, highest = (float(x[i]), highest) if cost(x) < limit else (low, float(x[i]))
+    x[i] = low
+    return x
 
 
 def minimise_from_grid(

@@ -9,7 +9,7 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.estimation.noise_model import MIN_VARIANCE_SHARE, ArmaNoise, WhiteNoise
-from servoscope.fit.search import Experiment, raise_unknown
+from servoscope.fit.search import raise_unknown
 from servoscope.models.lti import LinearSystem, autocovariances
 
 RESPONSE_TAIL = 1e-4  # of a closed loop's answer that an autocovariance may leave out
@@ -52,9 +52,7 @@ class WhiteNoiseFit:
 def fit_white_noise(system: LinearSystem, runs: Sequence[FloatArray], stride: int) -> WhiteNoiseFit:
     """Fit n_u and n_y to residuals v, one array per recording, by Whittle's likelihood (1953).
 
-    Its squares are the deviances of the exponential law that a periodogram follows around its spectrum (McCullagh and
-    Nelder, 1989, section 8.3). `system` leads from noise on u and on y to v, for example
-    `residual_system`.
+    `system` leads from noise on u and on y to v, for example `residual_system`.
     """
     from scipy.optimize import minimize
 
@@ -62,11 +60,7 @@ def fit_white_noise(system: LinearSystem, runs: Sequence[FloatArray], stride: in
     S = np.concatenate([_spectra(system, stride, len(v))[1:-1] for v in runs])
     size, level = S.mean(axis=0), float(I.mean())
     S = S / size + MIN_VARIANCE_SHARE
-    I = np.maximum(I / level, np.finfo(np.float64).tiny)
-
-    def deviance(x: FloatArray) -> FloatArray:
-        q = I / (S @ np.exp(x))
-        return np.asarray(np.sign(q - 1.0) * np.sqrt(2.0 * np.maximum(q - 1.0 - np.log(q), 0.0)))
+    I = I / level
 
     def cost(x: FloatArray) -> tuple[float, FloatArray]:
         parts = S * np.exp(x)
@@ -76,14 +70,10 @@ def fit_white_noise(system: LinearSystem, runs: Sequence[FloatArray], stride: in
     # of a residual that is no sum of white noises this search stops at a bound, and the autoregression is preferred:
     # the optimum beyond that bound explains the spectrum, but not the power
     bounds = [(MIN_LOG_POWER, MAX_LOG_POWER)] * 2
-    likely_x = minimize(cost, np.full(2, np.log(0.5)), jac=True, method="L-BFGS-B", bounds=bounds).x
-    fitted = Experiment(deviance, np.full(2, np.inf), low=MIN_LOG_POWER, high=MAX_LOG_POWER).at(np.asarray(likely_x))
-
-    most = [raise_unknown(fitted, i, MAX_LOUDEST, BISECTIONS).x[i] for i in (0, 1)]
-    likely, loudest = np.sqrt(np.exp(np.array([fitted.x, most])) * level / size).tolist()
-    return WhiteNoiseFit(
-        WhiteNoise(*likely), WhiteNoise(*loudest), 0.5 * fitted.cost + float((1.0 + np.log(I * level)).sum())
-    )
+    likely = np.asarray(minimize(cost, np.full(2, np.log(0.5)), jac=True, method="L-BFGS-B", bounds=bounds).x)
+    most = [raise_unknown(lambda x: cost(x)[0], likely, i, MAX_LOUDEST, BISECTIONS)[i] for i in (0, 1)]
+    noise, loudest = np.sqrt(np.exp(np.array([likely, most])) * level / size).tolist()
+    return WhiteNoiseFit(WhiteNoise(*noise), WhiteNoise(*loudest), cost(likely)[0] + len(I) * float(np.log(level)))
 
 
 def whittle_cost(model: ArmaNoise, runs: Sequence[FloatArray]) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.records import ExactPredictorFit
+from servoscope.core.arrays import FloatArray
 from servoscope.fit.plant_experiment import MAX_SAMPLES, PlantExperiment, initial_noise
 from servoscope.fit.search import fit, raise_unknown
 from servoscope.isolation.ml.goodness_of_fit import misspecification_columns, score_test
@@ -32,8 +33,13 @@ def fit_exact_predictor(baseline: Baseline, recordings: Sequence[Recording]) -> 
     likely = fit(recorded.search, recorded.start(), recorded.all_but_delay)
     if not np.isfinite(likely.cost) or recorded.is_silent(likely):
         return None
+
+    def cost(x: FloatArray) -> float:
+        return 0.5 * recorded.search.at(x.copy(), likely.free).cost
+
     # a minute hardly tells how loud n_u is: too much of it costs little, too little makes slow errors look certain
-    noise = recorded.fitted_noise(raise_unknown(likely, 0, MAX_LOUDER, BISECTIONS))
+    loudest = raise_unknown(cost, likely.x, 0, MAX_LOUDER, BISECTIONS)
+    noise = recorded.fitted_noise(recorded.search.at(loudest, likely.free))
     explained = baseline.model_copy(update={"exact": ExactPredictorFit(noise=noise, misfit=0.0)})
     windows = (RefitWindow.from_recording(explained, rec, 0, min(rec.samples, MAX_SAMPLES)) for rec in recordings)
     return ExactPredictorFit(noise=noise, misfit=max(_misfit(window) for window in windows))
