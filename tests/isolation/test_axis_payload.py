@@ -70,7 +70,7 @@ class TestPayload:
 
     def test_the_side_of_its_weight_is_known(self) -> None:
         coefficients = {**dict.fromkeys(plant().names, 1.0), "gravity": 0.0}
-        with pytest.raises(ValueError, match="gravity must not be 0"):
+        with pytest.raises(ValueError, match="gravity must not be 0 beside payload_arm"):
             AxisPlant.model_validate(plant().model_dump() | {"coefficients": coefficients})
 
     def test_what_a_payload_is_called(self) -> None:

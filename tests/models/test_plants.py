@@ -190,7 +190,7 @@ class TestPolynomial:
         [
             ({"inertia": 1.0}, "check viscous_friction"),
             ({"inertia": 1.0, "viscous_friction": 1.0, "friction": 2.0}, "check friction"),
-            ({"inertia": 0.0, "viscous_friction": 1.0}, "inertia must not be 0"),
+            ({"inertia": 0.0, "viscous_friction": 1.0}, "inertia must not be 0, it is the highest power"),
             ({"inertia": 1.0, "viscous_friction": -1.0}, "negative"),
         ],
     )

@@ -112,7 +112,7 @@ def test_silence_is_what_lasts_longer_than_the_interval(tmp_path: Path) -> None:
     begin = time.monotonic()
     running = Running(halls.service_of(path))
     until(lambda: asked(path, silent), 30.0)  # it was never heard
-    assert time.monotonic() - begin >= 3.0
+    assert 3.0 <= time.monotonic() - begin < 6.5
     running.end(stop=True)
     for name in ("hall.sqlite", "history.sqlite"):
         (tmp_path / name).unlink(missing_ok=True)
@@ -121,7 +121,7 @@ def test_silence_is_what_lasts_longer_than_the_interval(tmp_path: Path) -> None:
     until(lambda: asked(path, "SELECT * FROM checkpoints WHERE asset = 'press' AND sequence = 59"), 60.0)
     begin = time.monotonic()
     until(lambda: asked(path, silent), 30.0)
-    assert time.monotonic() - begin >= 2.5
+    assert 2.5 <= time.monotonic() - begin < 7.0
     running.end(stop=True)
 
 

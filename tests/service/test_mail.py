@@ -149,7 +149,7 @@ def test_a_try_has_a_deadline_even_where_the_server_drips() -> None:
         settings = settings_of(host="127.0.0.1", port=listener.getsockname()[1], encryption="none", timeout_s=0.5)
         begin = time.monotonic()
         result = deliver(entry(settings), settings, NOW)
-        assert time.monotonic() - begin < 10.0  # it drips for ever
+        assert time.monotonic() - begin < 1.5
         assert "not taken within 0.5 s" in result.detail
         stop.set()
         thread.join()
@@ -173,7 +173,7 @@ def test_the_deadline_holds_in_the_handshake_too() -> None:
         settings = settings_of(host="127.0.0.1", port=listener.getsockname()[1], timeout_s=1.0)
         begin = time.monotonic()
         result = deliver(entry(settings), settings, NOW)
-        assert time.monotonic() - begin < 4.5  # the other side waits for 5 s
+        assert time.monotonic() - begin < 1.4
         assert "not taken within 1 s" in result.detail
         thread.join()
 

@@ -139,7 +139,7 @@ def propose_columns(
 def propose_loop(paths: Sequence[Path], columns: Columns, where: Mapping[str, str] | None = None) -> LoopProposal:
     """Return a loop for logs whose columns are known, as `inspect` measures the first of them; `where`: as in `read`.
 
-    Logs that cannot be used with the first are left out, with a note. Raises RecordingError if that is unread or rests.
+    Logs that do not go with the first are left out, with a note. RecordingError: the first is unreadable, or at rest.
     """
     path, others = paths[0], paths[1:]
     columns, wraps = _unwrapped_columns(path, columns, where)

@@ -85,6 +85,13 @@ class CylinderRig:
     noise_y: float = 4e-6  # m
     substeps: int = 40
 
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not np.isfinite(value):
+                raise SimulationError(f"cylinder rig: {name} = {value:g} must be finite")
+        if min(self.area_a, self.area_b, self.stroke, self.mass, self.sample_rate, self.substeps) <= 0.0:
+            raise SimulationError("cylinder rig: areas, stroke, mass, sample_rate and substeps must be positive")
+
 
 @dataclass(frozen=True, eq=False)
 class CylinderTruth:
@@ -203,7 +210,7 @@ def simulate_cylinder(
     numbers, names = tuple(map(float, vars(rig).values())), tuple(vars(rig))
     run_cylinder(numbers, laws, whole, feed, noise, begin, u, acting, y, states, names=names, parameters=PARAMETERS)
     if not np.isfinite(states).all():
-        raise SimulationError("cylinder rig: the integration left all bounds, check its numbers or raise substeps")
+        raise SimulationError("cylinder rig: the integration left all bounds, raise substeps")
     used = slice(settling, None)
     channels = dict(zip(("p_A", "p_B", "p_S"), states[used, [2, 3, 7]].T.copy(), strict=True))
     recording = Recording(

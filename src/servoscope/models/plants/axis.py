@@ -148,9 +148,10 @@ class AxisPlant(TermPlant):
         return self
 
     @property
-    def leading(self) -> tuple[str, ...]:
-        """The inertia; beside a payload gravity too, whose sign says where it pulls."""
-        return ("inertia", *(("gravity",) if self._lifts else ()))
+    def leading(self) -> Mapping[str, str]:
+        """The inertia, and gravity beside a payload."""
+        side = {"gravity": " beside payload_arm, its sign says where a payload pulls"} if self._lifts else {}
+        return {"inertia": "", **side}
 
     @property
     def columns(self) -> tuple[TermColumn, ...]:

@@ -53,11 +53,13 @@ class PolynomialPlant(TermPlant):
     offset: bool = False  # whether a constant is added, for example gravity or a biased amplifier
 
     @property
-    def leading(self) -> tuple[str, ...]:
+    def leading(self) -> Mapping[str, str]:
         """The highest power; it may be that of the velocity by direction."""
         if self.order == 1 and self.friction == "directional":
-            return EXTRA_NAMES[Column.FORWARD], EXTRA_NAMES[Column.BACKWARD]
-        return (POWER_NAMES[self.order],)
+            names = [EXTRA_NAMES[Column.FORWARD], EXTRA_NAMES[Column.BACKWARD]]
+        else:
+            names = [POWER_NAMES[self.order]]
+        return dict.fromkeys(names, ", it is the highest power")
 
     @property
     def columns(self) -> tuple[TermColumn, ...]:

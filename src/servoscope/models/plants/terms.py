@@ -72,13 +72,13 @@ class TermPlant(Plant):
         if negative := [name for name, value in self.coefficients.items() if value < 0.0 and name in positive]:
             raise ValueError(f"coefficients: {negative[0]} must not be negative")
         if zero := [name for name in self.leading if not self.coefficients[name]]:
-            raise ValueError(f"coefficients: {zero[0]} must not be 0")
+            raise ValueError(f"coefficients: {zero[0]} must not be 0{self.leading[zero[0]]}")
         return self
 
     @property
-    def leading(self) -> tuple[str, ...]:
-        """Coefficients that may not be 0."""
-        return ()
+    def leading(self) -> Mapping[str, str]:
+        """Coefficients that may not be 0, each with what an error adds to that."""
+        return {}
 
     @property
     def has_physics(self) -> bool:
