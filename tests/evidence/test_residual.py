@@ -13,6 +13,7 @@ from servoscope.baseline.residual_model import (
     CLASSES,
     FADE_S,
     SIZE,
+    MotionFits,
     ResidualLayout,
     ResidualModel,
     fit_coefficients,
@@ -131,6 +132,17 @@ def test_a_fit_of_all_samples_shows_what_the_residual_hides(learned: ss.Baseline
     changes = {change.name: change.change or np.inf for change in baseline.detectability.changes}
     for ratio, shows in ((1.0 - 1.5 * changes["valve_forward"], True), (1.0 - 0.5 * changes["valve_forward"], False)):
         assert (ratios(baseline, day(47, FaultEvent("gain_extend", ratio, 0.0)))[2] > 1.0) == shows
+
+
+def test_what_a_motion_lets_expect_is_what_recordings_of_it_show() -> None:
+    fits = MotionFits(fits=((2.0, np.nan), (4.0, 1.0)), motions=((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)))
+    theta = np.array([3.0, 5.0])
+    # its own motion once, the other one's hardly, and the coefficients of all as half a fit; NaN: those of all
+    np.testing.assert_allclose(fits.expected(np.zeros(3), theta), [(2.0 + 0.5 * 3.0) / 1.5, 5.0], rtol=1e-6)
+    np.testing.assert_allclose(fits.expected(np.array([1.0, 0.0, 0.0]), theta)[1], (1.0 + 0.5 * 5.0) / 1.5, rtol=1e-6)
+    np.testing.assert_array_equal(fits.expected(np.full(3, 9.0), theta), theta)
+    tenth = np.array([np.log(1.1), 0.0, 0.0])  # a motion that is 10 % larger is much the same
+    assert abs(fits.expected(tenth, theta)[0] - fits.expected(np.zeros(3), theta)[0]) < 0.1
 
 
 def test_a_coefficient_that_rows_do_not_show_counts_nothing(learned: ss.Baseline) -> None:

@@ -33,6 +33,8 @@ SIZE = CLASSES + CORRELATIONS + 1  # number of features
 MIN_SAMPLES_PER_COEFFICIENT = 20  # usable samples that are fitted
 FADE_S = 0.1  # time in a class at which its mean counts half
 SAME_MOTION_RATIO = 1.6  # of rms position, speed and acceleration of r, up to which two recordings move alike
+LIKE_MOTION = 0.12  # difference of the logarithms of these, at which the fit of another recording counts 60 %
+COMMON_FITS = 0.5  # fits that the coefficients of all recordings count as, among those of like motions
 MIN_SHARE = 1e-4  # of the rms of eta: a smaller difference is no evidence
 MIN_COLUMN_SHARE = 0.05  # of the rms that a column has when healthy: with less it tells nothing of its coefficient
 
@@ -142,6 +144,29 @@ def _features(sums: FloatArray, fade: float) -> FloatArray:
     return np.concatenate([means / (counts + fade), correlations, np.sqrt(last[:1] / last[2])])
 
 
+class MotionFits(BaselineModel):
+    """Coefficients of healthy recordings by their motion: what no term explains repeats with it."""
+
+    fits: Matrix  # shape (m, n)
+    motions: Matrix  # `rms_motion` of each, shape (m, 3)
+    covariance: Matrix = ()  # of a further whole recording about what its motion lets expect, shape (n, n)
+
+    def expected(self, motion: FloatArray, theta: FloatArray) -> FloatArray:
+        """Return the coefficients that a motion (3,) lets expect, (n,); theta (n,) of all where none moved like it."""
+        fits, apart = np.array(self.fits), (np.array(self.motions) - motion) / LIKE_MOTION
+        weight = np.exp(-0.5 * (apart**2).sum(axis=1))
+        total = weight @ np.where(np.isfinite(fits), fits, theta) + COMMON_FITS * theta
+        return np.asarray(total / (weight.sum() + COMMON_FITS))
+
+
+def rms_motion(pipeline: Pipeline, recording: Recording, origin: float) -> FloatArray:
+    """Return the logarithms of the rms position, speed and acceleration of r, shape (3,)."""
+    r = recording.r - origin
+    g = pipeline.kinematics.regression(r, r, r, recording.restart)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(0.5 * np.log((g.phi[g.ok] ** 2).mean(axis=0)))
+
+
 class ResidualModel(BaselineModel):
     """The residuals of healthy recordings; everything that compares another recording with them."""
 
@@ -153,6 +178,7 @@ class ResidualModel(BaselineModel):
     # covariance (n, n) of coefficients fitted to half a recording, about the healthy ones; empty where not compared
     halves: Matrix = Field(default=(), exclude_if=lambda value: not value)
     rms: Vector = Field(default=(), exclude_if=lambda value: not value)  # of each column when healthy
+    like: MotionFits | None = Field(default=None, exclude_if=lambda value: value is None)
     fit_limit: float = Field(default=np.inf, exclude_if=np.isinf)  # of T^2/n of the coefficients of a whole recording
 
     @classmethod
@@ -206,8 +232,8 @@ class ResidualModel(BaselineModel):
 
     def deviation_of_rows(
         self, pipeline: Pipeline, recording: Recording, rows: slice, theta: FloatArray, along: CovariatePath | None
-    ) -> tuple[FloatArray, FloatArray] | None:
-        """Return a fit to some rows minus the healthy theta (n,), and how such fits scatter, (n, n).
+    ) -> StretchFit | None:
+        """Return a fit to some rows against theta (n,), moved along covariates or to what their motion lets expect.
 
         NaN where the rows do not show a coefficient; None where they are few, or healthy fits were not compared.
         """
@@ -217,7 +243,10 @@ class ResidualModel(BaselineModel):
             return None
         if along is not None:
             theta = along.expected(np.arange(recording.samples)[rows][g.ok]).mean(axis=0)
-        return fit_coefficients(g, np.array(self.rms or 0.0)) - theta, self.stretch_covariance(samples)
+        elif self.like is not None:
+            theta = self.like.expected(rms_motion(pipeline, part, self.layout.origin), theta)
+        deviation = fit_coefficients(g, np.array(self.rms or 0.0)) - theta
+        return StretchFit(deviation, self.stretch_covariance(samples), theta)
 
     def detectable_changes(self, directions: Mapping[str, FloatArray], covariance: FloatArray) -> dict[str, float]:
         """Return the smallest relative changes that leave the limit of the fit, by parameter; infinite: none does.
@@ -229,6 +258,19 @@ class ResidualModel(BaselineModel):
                 name: len(d) * self.fit_limit / (d @ solve_scaled(covariance, d)) for name, d in directions.items()
             }
         return {name: float(np.sqrt(size)) for name, size in sizes.items()}
+
+
+class StretchFit(NamedTuple):
+    """Coefficients fitted to some rows: how far they are from healthy (n,), how healthy ones scatter (n, n)."""
+
+    deviation: FloatArray
+    covariance: FloatArray
+    healthy: FloatArray  # shape (n,)
+
+    @property
+    def t2(self) -> float:
+        """Hotelling's statistic of a deviation by a coefficient."""
+        return mean_t2(self.deviation, self.covariance)
 
 
 def mean_t2(deviation: FloatArray, covariance: FloatArray) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.expectation import Expectation, reference_path
 from servoscope.baseline.pressure_model import PIECE_S
+from servoscope.baseline.residual_model import StretchFit
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError, RecordingError
 from servoscope.detection.onset import Onset
@@ -20,6 +21,7 @@ from servoscope.isolation.signature import Signature
 from servoscope.isolation.signatures import fault_signatures
 
 MAX_STRETCH_SAMPLES = 200_000  # of a stretch; more add nothing but memory
+MIN_ONSET_GAIN = 1.5  # of T^2 by rows from the onset on, over that of all rows: a change from the first sample has none
 HALF_STRETCH_TOLERANCE = 0.05  # stated relative deviation, up to which half a stretch is enough
 
 
@@ -89,7 +91,7 @@ def isolation_inputs(exam: Examination, onset: Onset, at: int) -> tuple[list[Sig
     And so it is where healthy recordings show how such fits scatter: what no term explains repeats with the motion.
     """
     recording, e, last = exam.recording, exam.estimates, int(exam.estimates.index[at])
-    first, whole = exam.memory_start(at), None
+    first, whole, healthy = exam.memory_start(at), None, np.array(exam.baseline.theta)
     if (exam.baseline.learned or exam.baseline.recursion.instrument is not None) and exam.noise is None:
         begin = max(
             stretch_begin(exam.baseline, onset.low_s, onset.high_s),
@@ -105,17 +107,35 @@ def isolation_inputs(exam: Examination, onset: Onset, at: int) -> tuple[list[Sig
     elif exam.pressures is not None:
         begin = onset.sample // round(PIECE_S * recording.sample_rate)
         return pressure_inputs(exam.pressures, exam.baseline.plant, begin)
-    elif (model := exam.baseline.residual) is not None:
-        begin = onset.sample
-        if last - begin < exam.pipeline.memory_samples:  # such an onset is hardly known: all of its interval counts
-            begin = round((onset.low_s - float(recording.t[0])) * recording.sample_rate)
-        rows, theta = slice(begin, last + 1), np.array(exam.baseline.theta)
-        stretch = model.deviation_of_rows(exam.pipeline, recording, rows, theta, exam.along)
-        whole = stretch if stretch is not None and np.isfinite(stretch[0]).all() else None
+    elif (fit := _surest_fit(exam, onset, last)) is not None:
+        whole, healthy = fit[:2], fit.healthy
     deviation, covariance = whole or recursive
     expectation = exam.expectation(first, last + 1) if exam.noise is not None else None
     recalled = recording.rows(slice(first, last + 1))
+    baseline = exam.baseline.model_copy(update={"theta": tuple(healthy.tolist())})
     settled = whole is not None
-    signatures = fault_signatures(exam.baseline, recalled, expectation, max(onset.sample - first, 0), settled)
+    signatures = fault_signatures(baseline, recalled, expectation, max(onset.sample - first, 0), settled)
     model_error = exam.model_error(slice(at, at + 1))[0]
     return signatures, deviation, covariance + model_error
+
+
+def _surest_fit(exam: Examination, onset: Onset, last: int) -> StretchFit | None:
+    """Return a fit to the rows from an onset to the last one, or to all rows where that is surer; None: neither.
+
+    Where the recursion raised no alarm, the change may have been there from the first sample on.
+    """
+    recording, model = exam.recording, exam.baseline.residual
+    if model is None:
+        return None
+    begin = onset.sample
+    if last - begin < exam.pipeline.memory_samples:  # such an onset is hardly known: all of its interval counts
+        begin = round((onset.low_s - float(recording.t[0])) * recording.sample_rate)
+    theta, rows = np.array(exam.baseline.theta), slice(begin, last + 1)
+    fit, whole = model.deviation_of_rows(exam.pipeline, recording, rows, theta, exam.along), exam.whole_fit
+    if fit is None or not np.isfinite(fit.deviation).all():
+        fit = None
+    if model.like is None or whole is None or not np.isfinite(whole.deviation).all() or exam.recursion_alarm.any():
+        return fit
+    if fit is not None and fit.t2 > MIN_ONSET_GAIN * whole.t2:
+        return fit
+    return whole._replace(covariance=np.array(model.like.covariance))

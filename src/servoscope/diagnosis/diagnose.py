@@ -287,9 +287,11 @@ def _explain_alarm(
         past = repaired_interval(exam, recursive, MIN_CERTAINTY, lambda: progress("refit"))
         return (past,), onset, []
     last = int(exam.estimates.index[alarm.evaluation])
-    # the refit takes the model for exact, but that of an axis follows the recording
+    # the refit takes the model for exact, but that of an axis follows the recording; what only a fit to the whole
+    # recording tells from healthy is named and sized by that fit
     seen = exam.change is not None or (
         not exam.drifts
+        and exam.recursion_alarm.any()
         and (exam.motion_excess(slice(int(exam.alarm.argmax()), alarm.evaluation + 1)) < UNSEEN_EXCESS).all()
     )
     refined = ml_refit.refit_recording(exam, onset, alarm.sample, last, lambda: progress("refit")) if seen else None
@@ -305,6 +307,9 @@ def _explain_alarm(
         if outside or not refined.is_unknown:
             onset = ml_refit.refit_onset(refined, exam, outside)
         doubts = ml_refit.disagreement_warnings(exam, candidates, refit, MIN_CERTAINTY)
+    elif (axis := exam.baseline.axis) is not None:
+        plant = exam.baseline.plant.model_copy(update={"coefficients": axis.coefficients})
+        candidates = tuple(candidate.weighed(plant) for candidate in candidates)
     best, t = candidates[0], exam.recording.t
     doubts += (implausible := implausible_warnings(exam, best))
     wait_s = exam.pipeline.bank.wait / exam.recording.sample_rate

@@ -24,7 +24,7 @@ from servoscope.isolation.ml import (
 )
 from servoscope.isolation.ml.axis_vibration import AxisVibration
 from servoscope.isolation.ml.search import OUTSIDE_PRIOR
-from servoscope.models.plants import Fault, Plant
+from servoscope.models.plants import Plant
 
 MIN_PAIR_PROBABILITY = 1e-3  # probability from which a pair of faults is listed
 MAX_EQUAL_MISFIT = 6.0  # squared standard deviations by which a pair may fit worse: its likelihood is a twentieth
@@ -168,7 +168,9 @@ def _candidate(hypothesis: Hypothesis, plant: Plant, least: float, noise_varianc
     fitted = hypothesis.fitted
     ratios, intervals = np.exp(fitted.x), np.exp(np.array(hypothesis.evidence.intervals))
     faults = tuple(
-        _fault_estimate(fault, plant, float(ratio), float(low), float(high))
+        FaultEstimate(
+            name=fault.name, parameter=fault.parameter, ratio=float(ratio), interval=(float(low), float(high))
+        ).weighed(plant)
         for fault, ratio, (low, high) in zip(fitted.faults, ratios, intervals, strict=True)
     )
     covariance = tuple(tuple(row) for row in (noise_variance * fitted.covariance).tolist()) if len(faults) > 1 else None
@@ -179,9 +181,3 @@ def _candidate(hypothesis: Hypothesis, plant: Plant, least: float, noise_varianc
         misfit=max(fitted.cost - least, 0.0) / noise_variance,
         covariance=covariance,
     )
-
-
-def _fault_estimate(fault: Fault, plant: Plant, ratio: float, low: float, high: float) -> FaultEstimate:
-    value, least, most = (plant.added_mass(fault.parameter, x) for x in (ratio, low, high))
-    mass = None if value is None or least is None or most is None else (value, least, most)
-    return FaultEstimate(name=fault.name, parameter=fault.parameter, ratio=ratio, interval=(low, high), mass_kg=mass)

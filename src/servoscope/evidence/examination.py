@@ -16,7 +16,7 @@ from servoscope.baseline.covariates import CovariatePath
 from servoscope.baseline.expectation import Expectation, ReferencePath, reference_path, residual_noise_model
 from servoscope.baseline.motion import RecordedMotion
 from servoscope.baseline.pressure_model import PressureEvidence
-from servoscope.baseline.residual_model import mean_t2
+from servoscope.baseline.residual_model import StretchFit
 from servoscope.core import outofcore
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import RecordingError
@@ -160,10 +160,12 @@ class Examination:
         if model is None:
             return np.full(3, np.nan)
         ratios, fit = model.ratios_of(self.pipeline, self.recording), self.whole_fit
-        return np.append(ratios, np.nan if fit is None or np.isnan(ratios).all() else mean_t2(*fit) / model.fit_limit)
+        if model.like is not None:  # changes within such a recording are scanned for, and its residual goes by the gain
+            ratios = 0.0 * ratios
+        return np.append(ratios, np.nan if fit is None or np.isnan(ratios).all() else fit.t2 / model.fit_limit)
 
     @cached_property
-    def whole_fit(self) -> tuple[FloatArray, FloatArray] | None:
+    def whole_fit(self) -> StretchFit | None:
         """`ResidualModel.deviation_of_rows` of all rows; None where nothing was learned or it is `quick`."""
         if self.quick or (model := self.baseline.residual) is None:
             return None
@@ -185,8 +187,12 @@ class Examination:
     @cached_property
     def apparent_alarm(self) -> BoolArray:
         """Whether a statistic of the coefficients was above its limit, after the delays, shape (K,)."""
-        changed = self._changed(self.apparent_change)
-        return changed | apply_alarm_delays(any_exceeded(self.statistics[:2]), *self.pipeline.delays)
+        return self._changed(self.apparent_change) | self.recursion_alarm
+
+    @cached_property
+    def recursion_alarm(self) -> BoolArray:
+        """Whether T^2 or the sequential test was above its limit, after the delays, shape (K,)."""
+        return apply_alarm_delays(any_exceeded(self.statistics[:2]), *self.pipeline.delays)
 
     @cached_property
     def change(self) -> AxisChange | None:

@@ -10,13 +10,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.records import Matrix
 from servoscope.baseline.residual_model import (
     POSITIONS,
     SPEED_SHARES,
+    MotionFits,
     ResidualLayout,
     ResidualModel,
     fit_coefficients,
     mean_t2,
+    rms_motion,
 )
 from servoscope.baseline.threshold import score_limit
 from servoscope.core.arrays import FloatArray, to_tuples
@@ -29,17 +32,16 @@ from servoscope.signals import Recording
 MIN_RECORDINGS = 6  # so that five judge each: fewer do not tell a drift from scatter
 MAX_FOLDS = 8  # of recordings that are left out, some together where there are more
 TOP_SPEED_QUANTILE = 0.99  # of the speed of a recording
+MOTION_MARGIN = 1.5  # of the limit of fits that are compared by motion: gains that nobody learned change them, too
+MODEL_ERROR_SHARE = 0.05  # of coefficients, by which few recordings of one load do not show that terms are off
 SHIFT_MARGIN = 2.0  # of the limit: differences of halves scatter with heavier tails than features
 ACCELERATION_QUANTILES = (1.0 / 3.0, 2.0 / 3.0)  # braking, neither, accelerating
 
 
 def _learn(healthy: HealthyRecordings, draft: Baseline) -> Learned:
-    """Learn the residual, unless an exact plant leaves noise alone: the tests of the coefficients know its size.
-
-    That of an axis is scanned for changes sample by sample, and has its own scatter.
-    """
+    """Learn the residual, unless an exact plant leaves noise alone: the tests of the coefficients know its size."""
     exact = draft.exact is not None and draft.exact.misfit <= 1.0
-    if exact or draft.axis is not None or healthy.loop.monitor.hidden_warm_up:
+    if exact or healthy.loop.monitor.hidden_warm_up:
         return None, ()
     return learn_residuals(healthy, np.array(draft.theta)), ()
 
@@ -75,23 +77,55 @@ def learn_residuals(healthy: HealthyRecordings, theta: FloatArray) -> ResidualMo
     if len(whole) < MIN_RECORDINGS:
         return None
     limits = score_limit(whole, share), SHIFT_MARGIN * score_limit(shift, PAST_BUDGET * share)
-    fits = _learn_fits(healthy, theta, share) if healthy.loop.plant.fits_stretches else {}
+    fits = _learn_fits(healthy, theta, origin, share) if healthy.loop.plant.fits_stretches else {}
     return _learn_model(layout, pipeline, recordings).model_copy(update={"limits": limits, **fits})
 
 
-def _learn_fits(healthy: HealthyRecordings, theta: FloatArray, share: float) -> dict[str, object]:
+def _learn_fits(healthy: HealthyRecordings, theta: FloatArray, origin: float, share: float) -> dict[str, object]:
     """Return how fits to halves of recordings scatter about theta (n,), and a limit from each recording left out."""
     regressions, m = healthy.regressions, len(healthy.regressions)
     rms = np.sqrt(np.mean([(g.phi[g.ok] ** 2).mean(axis=0) for g in regressions], axis=0))
-    halves = np.array([[fit_coefficients(half, rms) for half in g.halves] for g in regressions]) - theta
-    fits = {"halves": to_tuples(further_covariance(halves, m)), "rms": tuple(rms.tolist())}
+    fits = np.array([[fit_coefficients(part, rms) for part in (g, *g.halves)] for g in regressions])
+    left, known = fits - theta, {"rms": tuple(rms.tolist())}
     if healthy.covariates is not None:  # how they move coefficients is fitted to the same few recordings
-        return fits
-    # theta without a recording is off by as much more from it
-    whole = (np.array([fit_coefficients(g, rms) for g in regressions]) - theta) * m / (m - 1.0)
-    others = (further_covariance(np.delete(halves, i, axis=0), m - 1) for i in range(m))
-    scores = [mean_t2(deviation, C) for deviation, C in zip(whole, others, strict=True)]
-    return {**fits, "fit_limit": score_limit(scores, share)}
+        return {**known, "halves": to_tuples(further_covariance(left[:, 1:], m))}
+    left[:, 0] *= m / (m - 1.0)  # theta without a recording is off by as much more from it
+    like = None
+    if healthy.loop.plant.repeats_with_motion:
+        parts = [(rec, *(rec.rows(rows) for rows in _halves(rec.samples))) for rec in healthy.recordings]
+        motions = np.array([[rms_motion(healthy.pipeline, part, origin) for part in rec] for rec in parts])
+        left = _left_out_deviations(fits, motions, fits[:, 0] - left[:, 0])
+        whole = further_covariance(left[:, :1], m) + np.diag((MODEL_ERROR_SHARE * theta) ** 2)
+        like = _motion_fits(fits[:, 0], motions[:, 0], to_tuples(whole))
+    halves = further_covariance(left[:, 1:], m)
+    margin = MOTION_MARGIN if like is not None else 1.0
+    scores = [mean_t2(left[i, 0], further_covariance(np.delete(left[:, 1:], i, axis=0), m - 1)) for i in range(m)]
+    return {**known, "halves": to_tuples(halves), "like": like, "fit_limit": margin * score_limit(scores, share)}
+
+
+def _left_out_deviations(fits: FloatArray, motions: FloatArray, common: FloatArray) -> FloatArray:
+    """Return how far fits to m recordings and their halves (m, 3, n) are from what others of their motion show.
+
+    `motions` (m, 3, 3); `common` (m, n): coefficients of all recordings but each; NaN where a fit does not know one.
+    """
+    common = np.where(np.isfinite(common), common, np.nanmean(fits[:, 0], axis=0))
+    left, m = np.empty_like(fits), len(fits)
+    for i in range(m):
+        others = [k for k in range(m) if k != i]
+        for own in ([0], [1, 2]):  # wholes by wholes, halves by halves
+            like = _motion_fits(fits[np.ix_(others, own)], motions[np.ix_(others, own)])
+            left[i, own] = fits[i, own] - [like.expected(motion, common[i]) for motion in motions[i, own]]
+    return left
+
+
+def _halves(samples: int) -> tuple[slice, slice]:
+    return slice(samples // 2), slice(samples // 2, None)
+
+
+def _motion_fits(fits: FloatArray, motions: FloatArray, covariance: Matrix = ()) -> MotionFits:
+    """Return fits (..., n) at motions (..., 3)."""
+    rows = to_tuples(fits.reshape(-1, fits.shape[-1])), to_tuples(motions.reshape(-1, motions.shape[-1]))
+    return MotionFits(fits=rows[0], motions=rows[1], covariance=covariance)
 
 
 def further_covariance(left: FloatArray, recordings: int) -> FloatArray:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Self
+
 from pydantic import BaseModel, ConfigDict, Field
 
 from servoscope.baseline.learned_fault import SEVERITY
+from servoscope.models.plants import Plant
 
 UNKNOWN = "unknown"
 
@@ -43,6 +46,12 @@ class FaultEstimate(ResultModel):
         """How far from healthy it is: of the parameter's healthy value, or of the labelled severity."""
         return self.ratio if self.learned else abs(self.ratio - 1.0)
 
+    def weighed(self, plant: Plant) -> Self:
+        """Return it with the mass that its ratio stands for, where it is one of a payload whose place is known."""
+        value, low, high = (plant.added_mass(self.parameter, ratio) for ratio in (self.ratio, *self.interval))
+        mass = None if value is None or low is None or high is None else (value, low, high)
+        return self.model_copy(update={"mass_kg": mass})
+
 
 class Candidate(ResultModel):
     """One explanation of a detected change; ``unknown`` carries no faults."""
@@ -65,3 +74,7 @@ class Candidate(ResultModel):
     def is_learned(self) -> bool:
         """Whether it is a fault learned from labelled recordings."""
         return any(fault.learned for fault in self.faults)
+
+    def weighed(self, plant: Plant) -> Self:
+        """Return it with the masses of its faults."""
+        return self.model_copy(update={"faults": tuple(fault.weighed(plant) for fault in self.faults)})

@@ -115,6 +115,10 @@ class AxisPlant(TermPlant):
     """
 
     translations: ClassVar[Mapping[str, Mapping[str, str]]] = read_translations(__file__)
+    fits_stretches: ClassVar[bool] = True
+    repeats_with_motion: ClassVar[bool] = True
+    # friction carries the load too, and drives are no ideal source of force
+    ray_angles: ClassVar[Mapping[str, float]] = dict.fromkeys((*FAULTS, *PAYLOAD_FAULTS), 0.2)
 
     kind: Literal["axis"] = "axis"
     terms: Annotated[tuple[TermName, ...], TERM_TUPLE, UNIQUE_TERMS] = ("viscous", "coulomb", "offset")
@@ -207,6 +211,8 @@ class AxisPlant(TermPlant):
         known = {*self.names, "input_gain", *(("viscous_friction",) if by_direction else ())}
         told = FAULTS | PAYLOAD_FAULTS if self._lifts else FAULTS
         known |= {"moved_mass"} & {*told}
+        if self.payload_mass is not None:  # what hangs there is that mass: more weight of it is more of it
+            known -= {"gravity"}
         return tuple(
             self._fault(name, parameter, words, checks)
             for parameter, (name, words, checks) in told.items()
@@ -242,7 +248,9 @@ class AxisPlant(TermPlant):
         if parameter == "viscous_friction" and "viscous_by_direction" in self.terms:
             return dict.fromkeys(BY_DIRECTION, 1.0)
         if parameter == "moved_mass":
-            return dict.fromkeys(("inertia", "gravity", "load_friction"), 1.0)
+            # the motor's own inertia does not grow with the payload
+            share = self._unit_inertia(healthy) / healthy["inertia"] if healthy else 1.0
+            return {"inertia": share, "gravity": 1.0, "load_friction": 1.0}
         return super().exponents(parameter)
 
     def scaled(self, factors: Mapping[str, Any]) -> Self:
@@ -251,14 +259,16 @@ class AxisPlant(TermPlant):
         moved = super().scaled({name: factor for name, factor in factors.items() if name != "moved_mass"})
         if mass is not None:
             assert moved.coefficients is not None
-            self._load(moved.coefficients, (mass - 1.0) * self._unit_inertia() * factors.get("input_gain", 1.0))
+            self._load(
+                moved.coefficients, (mass - 1.0) * self._unit_inertia(self._nominal()) * factors.get("input_gain", 1.0)
+            )
         return moved
 
-    def _unit_inertia(self) -> float:
+    def _unit_inertia(self, coefficients: Mapping[str, float]) -> float:
         """Return the inertia that a ratio of 1 more stands for: the axis's own, or that of the mass that it carries."""
         if self.payload_mass is None or self.payload_arm is None:
-            return self._nominal()["inertia"]
-        return abs(self._nominal()["gravity"]) * self.payload_arm / GRAVITY_ACCELERATION
+            return coefficients["inertia"]
+        return abs(coefficients["gravity"]) * self.payload_arm / GRAVITY_ACCELERATION
 
     def _load(self, coefficients: dict[str, Any], inertia: Any) -> None:
         """Add the inertia m l^2 of a payload, its weight m g l on the side of the arm's own, and its share of friction.
