@@ -24,6 +24,7 @@ import math
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib.util import find_spec
 from typing import Any
 
@@ -117,15 +118,20 @@ def _decode_binary(asset: str, message: bytes, received_at: float, covariates: S
     return _build_block(asset, stream, sequence, oldest if flags & FLAG_RETAINED else None, signals, received_at)
 
 
+@cache  # its memory is used again; while an error holds the document before, it refuses, and `_decode_json` reads
+def _parser() -> Any:
+    import simdjson
+
+    return simdjson.Parser()
+
+
 def _decode_regular(asset: str, message: bytes, received_at: float) -> Block | None:
     """Return what `_decode_json` returns, in a third of its time; None: not regular, which it knows more of.
 
     A message is regular if it has no covariates, each key once, and numbers alone in its lists.
     """
-    import simdjson
-
     try:
-        document: Any = simdjson.Parser().parse(message)
+        document = _parser().parse(message)
         plain = {name: document[name] for name in document}  # to ask it for a key that it lacks takes long
         counts = version, stream, sequence, oldest = (
             plain["version"],
