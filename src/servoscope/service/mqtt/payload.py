@@ -147,9 +147,8 @@ def _decode_regular(asset: str, message: bytes, received_at: float) -> Block | N
     # a buffer makes one list of lists in lists; of a key that stands twice the last counts, not the first
     brackets = len(message) - len(message.replace(b"[", b""))  # in a sixth of the time of `message.count`
     are_flat = brackets == len(columns) and {*map(len, columns)} == {signals.shape[1]}
-    if not (are_flat and len(plain) == len(document) and plain.keys() <= REGULAR_KEYS):
-        return None
-    if version != VERSION or {*map(type, counts)} != {int}:
+    are_known = len(plain) == len(document) and plain.keys() <= REGULAR_KEYS
+    if not (are_flat and are_known and version == VERSION and {*map(type, counts)} == {int}):
         return None
     if len(columns) == 3:
         t = _uniform_times(_parse_number(plain, "t0"), _parse_number(plain, "dt"), signals.shape[1])
