@@ -267,7 +267,8 @@ def diagnose(
     from servoscope.diagnosis.diagnose import diagnose as diagnose_recording
     from servoscope.diagnosis.diagnose import diagnose_with_trace
     from servoscope.diagnosis.verify import provenance
-    from servoscope.report import document, plain_values, write_diagnosis_page
+    from servoscope.report import document, plain_values
+    from servoscope.report.diagnosis_page import write_diagnosis_page
     from servoscope.signals.writers import write_table
 
     if (of_arm := ArmBaseline.load(baseline)) is not None:

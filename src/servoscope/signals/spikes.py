@@ -20,7 +20,6 @@ NEIGHBOURS = 20  # samples on either side that define what is normal
 STEP_SHARE = 0.02  # of the reference's range: smaller steps do not make u kick
 REACTION_SAMPLES = 3  # samples in which u may kick after a step of r
 PASSES = 30
-LEVEL_SAMPLES = 500  # samples that are enough to guess two levels
 CHUNK_PLACES = 4096  # that are looked at together: each of them brings the pages around it into memory
 
 
@@ -43,8 +42,6 @@ def find_spikes(
     samples may jump, for example u where the reference steps.
     """
     spikes = NO_ROWS
-    if _is_quiet(x, run, share):
-        return spikes
     for _ in range(PASSES):  # spikes hide others: range and neighbours are taken again without those found
         z, runs = outofcore.drop_rows(x, spikes), outofcore.drop_rows(run, spikes)
         before = spikes - np.arange(spikes.size)
@@ -74,35 +71,6 @@ def follows_reference_step(r: FloatArray, run: npt.NDArray[np.int32], rows: Inde
             )
             kicked[places] |= (inside & (is_step | (run[at] != run[at - 1]))) | (rows[places] == offset)
     return kicked
-
-
-def _is_quiet(x: FloatArray, run: npt.NDArray[np.int32], share: float) -> bool:
-    """Return whether it is certain that there is no spike: of most signals, told in a tenth of the search's time.
-
-    More than 1 % of the samples lie beyond either of two levels, so the range of the search is no smaller than their
-    distance; what is no spike for this range is none for the search either. At the edge of a run, `MAX_WIDTH` steps
-    that are no higher than a spike must be are less than an enormous one.
-    """
-    if not 2 * NEIGHBOURS <= x.size <= outofcore.CHUNK_ROWS:
-        return False
-    some = x[:: max(1, x.size // LEVEL_SAMPLES)]
-    place = some.size // 20
-    low, high = np.partition(some, [place, some.size - 1 - place])[[place, some.size - 1 - place]].tolist()
-    enough, span = 0.01 * x.size + 1.0, high - low
-    if span <= 0.0 or min(np.count_nonzero(x <= low), np.count_nonzero(x >= high)) <= enough:
-        return False
-    steps = np.abs(x[1:] - x[:-1])
-    highest, modest, enormous = float(steps.max()), share * span, MIN_WIDE_SPIKE_FACTOR * span
-    if highest <= modest:
-        return True
-    if highest > enormous:
-        return False
-    entered = np.append(0, np.flatnonzero((steps > modest) | (run[1:] != run[:-1])) + 1)
-    for width in range(1, MAX_NORMAL_WIDTH + 1):
-        start, height = _find_excursions(x, run, entered, width, modest, enormous)
-        if (height > LOCAL_STEP_FACTOR * _local_step_quartile(x, start, np.full(start.size, width))).any():
-            return False
-    return True
 
 
 def _find_spikes_once(
