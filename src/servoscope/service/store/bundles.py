@@ -46,7 +46,6 @@ class BundleChanges(NamedTuple):
     sparse: list[BundleKey]  # few of their blocks are still needed, and these go on as rows of their own
 
 
-@cache
 def bundle_number(asset: str) -> int:
     """Return the bundle that an asset is in, always and in every store."""
     return zlib.crc32(asset.encode()) % BUNDLES
@@ -58,6 +57,7 @@ class BundleIndex:
     def __init__(self, rows: Iterable[tuple[int, int, str]]) -> None:
         self._number = 0  # of the newest row
         self._counts: dict[BundleKey, list[int]] = {}  # how many blocks of a row are needed, and how many there are
+        self._bundle_number = cache(bundle_number)
         # of each asset, sequences and where they are
         self._held: defaultdict[str, deque[tuple[int, BundleKey]]] = defaultdict(deque)
         self._sparse: dict[BundleKey, int] = {}  # the newest row when at most half of a row was needed any more
@@ -91,7 +91,7 @@ class BundleIndex:
         bundles: defaultdict[BundleKey, tuple[list[BundlePart], list[bytes]]] = defaultdict(lambda: ([], []))
         sizes, newest = defaultdict[int, int](int), self._number  # of each bundle, bytes so far
         for asset, sequence, stored, regular in wanted:
-            bundle = bundle_number(asset)
+            bundle = self._bundle_number(asset)
             sizes[bundle] += len(stored)
             parts, samples = bundles[bundle, newest + sizes[bundle] // ROW_BYTES]
             parts.append((asset, sequence, len(stored), regular))
