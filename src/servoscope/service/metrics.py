@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections import Counter as TotalCounter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,11 +16,9 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import ConfigError
 from servoscope.service.assets.asset import Asset
 from servoscope.service.assets.status import asset_verdict
-from servoscope.service.clock import LayerTimes
 from servoscope.service.health import alarm_gauge
-from servoscope.service.sources.inbox import Inbox
+from servoscope.service.parts import ServiceParts
 from servoscope.service.sources.message import Rejection
-from servoscope.service.writer import StoreWriter
 from servoscope.signals import quality
 
 if TYPE_CHECKING:
@@ -38,24 +36,10 @@ STREAM_COUNTERS = {
 BUCKETS_S = tuple(float(f"{base}e{power}") for power in (-3, -2, -1, 0, 1) for base in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0))
 
 
-class MetricsContext(Protocol):
-    """What the metrics read of a service."""
-
-    assets: dict[str, Asset]
-    sources: dict[str, Inbox]
-    writer: StoreWriter
-    layers: LayerTimes
-    last_turn: float  # when it last polled its sources, by the monotonic clock [s]
-
-    @property
-    def troubles(self) -> Mapping[str, str]:
-        """What is wrong with the connection of each source and outlet, in words, by its name; empty: nothing."""
-
-
 class ServiceMetrics:
     """The metrics of one service; counts of assets are those of their checkpoints, and continue over restarts."""
 
-    def __init__(self, service: MetricsContext) -> None:
+    def __init__(self, service: ServiceParts) -> None:
         try:
             from prometheus_client import CollectorRegistry, Counter, Histogram
         except ModuleNotFoundError:
@@ -90,9 +74,8 @@ class ServiceMetrics:
         from prometheus_client import generate_latest
 
         start = time.thread_time()
-        series = write_asset_series(self._service.assets)
-        self._alarms = series.alarms
-        text = generate_latest(self.registry) + series.text.encode()
+        series, self._alarms = write_asset_series(self._service.assets)
+        text = generate_latest(self.registry) + series.encode()
         self._render_s += time.thread_time() - start
         return text
 
@@ -143,15 +126,11 @@ class ServiceMetrics:
             yield GaugeMetricFamily(f"servoscope_{name}", words, value=float(value))
 
 
-class AssetSeries(NamedTuple):
-    """The series of all assets, and how many alarms of each name, priority and state are not normal."""
+def write_asset_series(assets: Mapping[str, Asset]) -> tuple[str, TotalCounter[tuple[str, str, str]]]:
+    """Return the metrics of assets as text, and how many alarms of each name, priority and state are not normal.
 
-    text: str
-    alarms: TotalCounter[tuple[str, str, str]]
-
-
-def write_asset_series(assets: Mapping[str, Asset]) -> AssetSeries:
-    """Write down the metrics of assets, from any thread; those that have not begun have only a reception."""
+    From any thread; assets that have not begun have only a reception.
+    """
     counts: dict[str, list[str]] = {key: [] for key in STREAM_COUNTERS}
     last, verdicts, receptions, alarms = list[str](), list[str](), list[str](), TotalCounter[tuple[str, str, str]]()
     for name, asset in assets.items():
@@ -178,7 +157,7 @@ def write_asset_series(assets: Mapping[str, Asset]) -> AssetSeries:
     for name, kind, words, lines in families:
         heads = f"# HELP servoscope_{name} {words}", f"# TYPE servoscope_{name} {kind}"
         text += "\n".join([*heads, *lines, ""])
-    return AssetSeries(text, alarms)
+    return text, alarms
 
 
 def escape_label(value: str) -> str:
