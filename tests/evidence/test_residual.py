@@ -135,11 +135,11 @@ def test_a_fit_of_all_samples_shows_what_the_residual_hides(learned: ss.Baseline
 
 
 def test_what_a_motion_lets_expect_is_what_recordings_of_it_show() -> None:
-    fits = MotionFits(fits=((2.0, np.nan), (4.0, 1.0)), motions=((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)))
+    fits = MotionFits(fits=((2.0, 7.0), (4.0, 1.0)), motions=((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)))
     theta = np.array([3.0, 5.0])
-    # its own motion once, the other one's hardly, and the coefficients of all as half a fit; NaN: those of all
-    np.testing.assert_allclose(fits.expected(np.zeros(3), theta), [(2.0 + 0.5 * 3.0) / 1.5, 5.0], rtol=1e-6)
-    np.testing.assert_allclose(fits.expected(np.array([1.0, 0.0, 0.0]), theta)[1], (1.0 + 0.5 * 5.0) / 1.5, rtol=1e-6)
+    # its own motion once, the other one's hardly, and the coefficients of all as half a fit
+    for motion, fit in zip(np.array(fits.motions), np.array(fits.fits), strict=True):
+        np.testing.assert_allclose(fits.expected(motion, theta), (fit + 0.5 * theta) / 1.5, rtol=1e-6)
     np.testing.assert_array_equal(fits.expected(np.full(3, 9.0), theta), theta)
     tenth = np.array([np.log(1.1), 0.0, 0.0])  # a motion that is 10 % larger is much the same
     assert abs(fits.expected(tenth, theta)[0] - fits.expected(np.zeros(3), theta)[0]) < 0.1

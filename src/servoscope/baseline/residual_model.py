@@ -153,9 +153,9 @@ class MotionFits(BaselineModel):
 
     def expected(self, motion: FloatArray, theta: FloatArray) -> FloatArray:
         """Return the coefficients that a motion (3,) lets expect, (n,); theta (n,) of all where none moved like it."""
-        fits, apart = np.array(self.fits), (np.array(self.motions) - motion) / LIKE_MOTION
+        apart = (np.array(self.motions) - motion) / LIKE_MOTION
         weight = np.exp(-0.5 * (apart**2).sum(axis=1))
-        total = weight @ np.where(np.isfinite(fits), fits, theta) + COMMON_FITS * theta
+        total = weight @ np.array(self.fits) + COMMON_FITS * theta
         return np.asarray(total / (weight.sum() + COMMON_FITS))
 
 
@@ -221,7 +221,8 @@ class ResidualModel(BaselineModel):
         share = residual.samples / self.samples
         moved = residual.shift - _expected_shift(whole, residual)
         scores = whole.score(residual.features[0], 2.0 * share, c), shift.score(moved, share)
-        return np.array(scores) / self.limits
+        # an axis is scanned for changes within a recording, and what its terms leave of u goes by the gain
+        return np.array(scores) / self.limits if self.like is None else np.zeros(2)
 
     def stretch_covariance(self, samples: float) -> FloatArray:
         """Return the covariance (n, n) of coefficients fitted to so many usable samples of a healthy recording.

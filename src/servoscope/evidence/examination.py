@@ -156,21 +156,18 @@ class Examination:
     @cached_property
     def residual_ratios(self) -> FloatArray:
         """`ResidualModel.ratios`, and how far a fit is from healthy over its limit, shape (3,); NaN: no evidence."""
-        model = None if self.quick else self.baseline.residual
-        if model is None:
+        if self.quick or (model := self.baseline.residual) is None:
             return np.full(3, np.nan)
         ratios, fit = model.ratios_of(self.pipeline, self.recording), self.whole_fit
-        if model.like is not None:  # changes within such a recording are scanned for, and its residual goes by the gain
-            ratios = 0.0 * ratios
         return np.append(ratios, np.nan if fit is None or np.isnan(ratios).all() else fit.t2 / model.fit_limit)
 
     @cached_property
     def whole_fit(self) -> StretchFit | None:
         """`ResidualModel.deviation_of_rows` of all rows; None where nothing was learned or it is `quick`."""
-        if self.quick or (model := self.baseline.residual) is None:
-            return None
-        theta = np.array(self.baseline.theta)
-        return model.deviation_of_rows(self.pipeline, self.recording, slice(None), theta, self.along)
+        model, rows, theta = None if self.quick else self.baseline.residual, slice(None), np.array(self.baseline.theta)
+        return (
+            None if model is None else model.deviation_of_rows(self.pipeline, self.recording, rows, theta, self.along)
+        )
 
     @cached_property
     def pressures(self) -> PressureEvidence | None:

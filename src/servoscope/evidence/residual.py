@@ -94,28 +94,29 @@ def _learn_fits(healthy: HealthyRecordings, theta: FloatArray, origin: float, sh
     if healthy.loop.plant.repeats_with_motion:
         parts = [(rec, *(rec.rows(rows) for rows in _halves(rec.samples))) for rec in healthy.recordings]
         motions = np.array([[rms_motion(healthy.pipeline, part, origin) for part in rec] for rec in parts])
-        left = _left_out_deviations(fits, motions, fits[:, 0] - left[:, 0])
+        common = fits[:, :1] - left[:, :1]
+        known_fits = np.where(np.isfinite(fits), fits, np.where(np.isfinite(common), common, theta))
+        left = fits - _expected_by_others(known_fits, motions, known_fits[:, 0] - np.nan_to_num(left[:, 0]))
         whole = further_covariance(left[:, :1], m) + np.diag((MODEL_ERROR_SHARE * theta) ** 2)
-        like = _motion_fits(fits[:, 0], motions[:, 0], to_tuples(whole))
+        like = _motion_fits(known_fits[:, 0], motions[:, 0], to_tuples(whole))
     halves = further_covariance(left[:, 1:], m)
     margin = MOTION_MARGIN if like is not None else 1.0
     scores = [mean_t2(left[i, 0], further_covariance(np.delete(left[:, 1:], i, axis=0), m - 1)) for i in range(m)]
     return {**known, "halves": to_tuples(halves), "like": like, "fit_limit": margin * score_limit(scores, share)}
 
 
-def _left_out_deviations(fits: FloatArray, motions: FloatArray, common: FloatArray) -> FloatArray:
-    """Return how far fits to m recordings and their halves (m, 3, n) are from what others of their motion show.
+def _expected_by_others(fits: FloatArray, motions: FloatArray, common: FloatArray) -> FloatArray:
+    """Return what the motion of m recordings and of their halves lets the others expect, (m, 3, n), as the fits are.
 
-    `motions` (m, 3, 3); `common` (m, n): coefficients of all recordings but each; NaN where a fit does not know one.
+    `motions` (m, 3, 3); `common` (m, n): coefficients of all recordings but each.
     """
-    common = np.where(np.isfinite(common), common, np.nanmean(fits[:, 0], axis=0))
-    left, m = np.empty_like(fits), len(fits)
+    expected, m = np.empty_like(fits), len(fits)
     for i in range(m):
         others = [k for k in range(m) if k != i]
         for own in ([0], [1, 2]):  # wholes by wholes, halves by halves
             like = _motion_fits(fits[np.ix_(others, own)], motions[np.ix_(others, own)])
-            left[i, own] = fits[i, own] - [like.expected(motion, common[i]) for motion in motions[i, own]]
-    return left
+            expected[i, own] = [like.expected(motion, common[i]) for motion in motions[i, own]]
+    return expected
 
 
 def _halves(samples: int) -> tuple[slice, slice]:
