@@ -11,10 +11,9 @@ from servoscope.core.messages import Message, message, text_message
 from servoscope.design.fisher_information import MISNAMED, cosines, equivalent_distance
 from servoscope.design.scenario import Scenario
 from servoscope.fit.predictor import Predictor
-from servoscope.isolation.ml.window import COMPLEX_STEP
+from servoscope.isolation.ml.window import COMPLEX_STEP, SENSOR_GAIN
 
 PARALLEL = 1e-6  # 1 - cosine^2 below which two changes are one and the same
-LOUDER = 1e-4  # gain by which one is taken
 DELAY_STEP = 0.01  # samples of delay by which the derivative is taken
 
 
@@ -31,17 +30,17 @@ class MimicCause:
 def mimic_causes(scene: Scenario) -> list[MimicCause]:
     """Return what else may change: further parts of the plant, gains of both sensors, the delay."""
     window, plant, m = scene.healthy, scene.baseline.plant, scene.healthy.nuisance_count
-    names = tuple(plant.causes)
+    names = (*plant.causes, SENSOR_GAIN)
     J = window.jacobian(np.zeros(m + len(names)), names, scene.profile, slice(m, None))
-    causes = [MimicCause(name, text_message(plant.causes[name]), "relative", J[:, i]) for i, name in enumerate(names)]
+    causes = [
+        MimicCause(name, text_message(plant.causes[name]), "relative", J[:, i]) for i, name in enumerate(plant.causes)
+    ]
     healthy, factory = window.healthy, window.factory
-    louder, softer = (factory.predictor(plant, output_gain=1.0 + step) for step in (LOUDER, -LOUDER))
     stronger = factory.predictor(plant.model_copy(update={"input_gain": plant.input_gain * (1.0 + 1j * COMPLEX_STEP)}))
     later = factory.predictor(plant, later_s=DELAY_STEP / scene.loop.sample_rate)
-    gain_of_y = (_innovation_column(scene, louder) - _innovation_column(scene, softer)).real / (2.0 * LOUDER)
     return [
         *causes,
-        MimicCause("gain of y", message("design.gain_of_y"), "relative", gain_of_y),
+        MimicCause("gain of y", message("design.gain_of_y"), "relative", J[:, -1]),
         MimicCause(
             "gain of u",
             message("design.gain_of_u"),
