@@ -294,14 +294,16 @@ class Plant(BaseModel, abc.ABC):
         Raises LoopError if no nominal value is known.
         """
 
-    @abc.abstractmethod
     def state_space(self) -> StateSpace:
         """Continuous linear part from u as recorded to y: A (n, n), B (n, 1), C (1, n), in physical states.
 
-        The states keep their meaning when a parameter changes, so a switch of plants carries them over.
+        The states keep their meaning when a parameter changes, so a switch of plants carries them over. A plant has
+        this, or `state_spaces`.
 
         Raises LoopError if no nominal values are known.
         """
+        A, B, C = self.state_spaces({}, 1)
+        return A[0], B[0], C[0]
 
     def state_spaces(self, factors: Mapping[str, Any], count: int) -> StateSpace:
         """Return the `state_space` of so many plants at once: A (count, n, n), B (count, n, 1), C (count, 1, n).
