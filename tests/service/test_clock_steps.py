@@ -40,7 +40,7 @@ def test_a_service_s_own_alarm_keeps_its_dates(machine: MachineClock) -> None:
     writer = SimpleNamespace(fill_ratio=1.0, add=lambda owner, rows: None)
     notifier = Notifier("hall", alarms, ActionSettings())
     service: Any = SimpleNamespace(writer=writer, notifier=notifier, assets={}, troubles={}, clock=SteadyClock())
-    housekeeping, start = Housekeeping(service), TIME()
+    housekeeping, start = Housekeeping(service, service), TIME()
     for machine.offset_s in (0.0, 7200.0, -7200.0):
         housekeeping._update_service_alarms()
     alarm = notifier.status["alarms"]["buffering"]

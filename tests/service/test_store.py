@@ -311,7 +311,7 @@ def test_sizes_of_many_assets_are_thinned_some_at_each_look(store: Store) -> Non
     batch = Batch()
     batch.rows["sizes"] = [{"asset": "gone", "t": t, **size} for t in (10.0, 20.0)]
     store.write(batch, "hall", 2)
-    housekeeping = Housekeeping(context)
+    housekeeping = Housekeeping(context, context)
     housekeeping._to_thin = dict.fromkeys(["gone", *names], 1e7)
     left = []
     for _ in range(2):

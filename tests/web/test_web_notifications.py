@@ -65,7 +65,7 @@ def test_a_test_goes_the_way_of_an_alarm_and_is_tried_once(context: Context) -> 
     service: Any = SimpleNamespace(
         store=context.store, notifier=notifier, writer=writer, assets={}, clock=SteadyClock()
     )
-    Housekeeping(service)._execute_commands()
+    Housekeeping(service, service)._execute_commands()
     outbox, audit = added["hall"]
     assert (
         audit.table == "audit" and audit.values["who"] == "local" and batch.outcomes[command["id"]]["outcome"] == "done"

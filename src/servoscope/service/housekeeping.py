@@ -5,20 +5,15 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Protocol
 
 from servoscope.core.errors import AlarmError, StoreUnavailableError
-from servoscope.service.actions.dispatcher import OutboxDispatcher
 from servoscope.service.alarms import LifecycleEvent, OperatorCommand
-from servoscope.service.assets.asset import Asset
 from servoscope.service.assets.records import StepResult, audit_row
 from servoscope.service.assets.status import Announcement
-from servoscope.service.clock import SteadyClock
-from servoscope.service.config import ServiceFile, StoreSettings
+from servoscope.service.config import StoreSettings
 from servoscope.service.log import log
-from servoscope.service.metrics import MetricsContext, ServiceMetrics
-from servoscope.service.notifications import Notifier
+from servoscope.service.metrics import ServiceMetrics
+from servoscope.service.parts import ServiceParts
 from servoscope.service.sources.message import RejectionCounter
 from servoscope.service.store import CommandOutcome, Row, Store
 from servoscope.service.store.rows import BASELINE_NOTE, CONFIRMATION, NOTE, RELEARN, TEST
@@ -30,31 +25,11 @@ THIN_WITHIN_S = 1800.0  # the sizes of all assets are thinned, some at each look
 REJECTIONS_EVERY_S = 60.0  # between two audit rows about a flood of bad messages
 
 
-class HousekeepingContext(MetricsContext, Protocol):
-    """What housekeeping needs of a service."""
-
-    config: ServiceFile
-    clock: SteadyClock
-    store: Store
-    notifier: Notifier
-    dispatcher: OutboxDispatcher
-    metrics: ServiceMetrics
-
-    def reload(self, path: Path) -> None:
-        """Change to what the service file says now, soon."""
-
-    def note_refusal(self, name: str, why: str) -> None:
-        """Note that something of an asset came and could not be used."""
-
-    def handle_result(self, asset: Asset, result: StepResult) -> None:
-        """Store and announce what a step of an asset has led to."""
-
-
 class Housekeeping:
     """Done by a service for itself."""
 
-    def __init__(self, service: HousekeepingContext) -> None:
-        self._service = service
+    def __init__(self, service: ServiceParts, metrics: ServiceMetrics) -> None:
+        self._service, self._metrics = service, metrics
         self._executed: set[int] = set()  # commands whose outcome is not yet stored
         self._rejections = RejectionCounter()
         self._last_note, self._announced = 0, dict[str, Announcement | None]()
@@ -108,7 +83,7 @@ class Housekeeping:
         """Store what came from outside and could not be used: at once, then once a minute, for each of its kinds."""
         for name, source in self._service.sources.items():
             for rejection in source.rejections.take():
-                self._service.metrics.record_rejection(name, rejection)
+                self._metrics.record_rejection(name, rejection)
                 if rejection.asset:
                     self._service.note_refusal(rejection.asset, rejection.reason)
                 self._rejections.add(rejection.asset or name, rejection.kind, rejection.reason, rejection.count)

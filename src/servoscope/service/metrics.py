@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections import Counter as TotalCounter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -16,11 +16,9 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import ConfigError
 from servoscope.service.assets.asset import Asset
 from servoscope.service.assets.status import asset_verdict
-from servoscope.service.clock import LayerTimes
 from servoscope.service.health import alarm_gauge
-from servoscope.service.sources.inbox import Inbox
+from servoscope.service.parts import ServiceParts
 from servoscope.service.sources.message import Rejection
-from servoscope.service.writer import StoreWriter
 from servoscope.signals import quality
 
 if TYPE_CHECKING:
@@ -38,24 +36,10 @@ STREAM_COUNTERS = {
 BUCKETS_S = tuple(float(f"{base}e{power}") for power in (-3, -2, -1, 0, 1) for base in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0))
 
 
-class MetricsContext(Protocol):
-    """What the metrics read of a service."""
-
-    assets: dict[str, Asset]
-    sources: dict[str, Inbox]
-    writer: StoreWriter
-    layers: LayerTimes
-    last_turn: float  # when it last polled its sources, by the monotonic clock [s]
-
-    @property
-    def troubles(self) -> Mapping[str, str]:
-        """What is wrong with the connection of each source and outlet, in words, by its name; empty: nothing."""
-
-
 class ServiceMetrics:
     """The metrics of one service; counts of assets are those of their checkpoints, and continue over restarts."""
 
-    def __init__(self, service: MetricsContext) -> None:
+    def __init__(self, service: ServiceParts) -> None:
         try:
             from prometheus_client import CollectorRegistry, Counter, Histogram
         except ModuleNotFoundError:

@@ -14,26 +14,23 @@ from servoscope import __version__
 from servoscope.core.errors import ServoscopeError, StoreUnavailableError
 from servoscope.core.messages import count_words, message, render
 from servoscope.prognosis.forecast import Prognosis
-from servoscope.service.actions.dispatcher import OutboxDispatcher
-from servoscope.service.assets.asset import Asset
 from servoscope.service.assets.examination import StoredDiagnosis
 from servoscope.service.assets.examination_schedule import PendingDiagnosis
 from servoscope.service.assets.groups import QuietBlocks
-from servoscope.service.assets.reception import RECEPTION_OK, ReceptionClock, ReceptionLog
+from servoscope.service.assets.reception import RECEPTION_OK, ReceptionLog
 from servoscope.service.assets.records import StepResult, audit_row
 from servoscope.service.build import ServiceComponents
-from servoscope.service.clock import SteadyClock
 from servoscope.service.config import ServiceFile
 from servoscope.service.diagnosis_worker import DiagnosisWorker, find_due_prognosis
 from servoscope.service.health import HealthReport
 from servoscope.service.housekeeping import Housekeeping
 from servoscope.service.log import log, set_level
 from servoscope.service.metrics import ServiceMetrics
+from servoscope.service.parts import ServiceParts
 from servoscope.service.process_supervisor import notify_systemd
 from servoscope.service.reload import reload_components
 from servoscope.service.sources.block import Block
 from servoscope.service.sources.inbox import Inbox
-from servoscope.service.writer import StoreWriter
 
 MAX_BLOCKS_PER_POLL = 1024  # blocks of one source that are processed before it is another one's turn
 MAX_PAUSE_S = 0.05
@@ -42,40 +39,22 @@ HOUSEKEEPING_EVERY_S = 1.0
 PROGNOSIS_RETRY_S = 60.0  # after one that failed
 
 
-class Service:
+class Service(ServiceParts):
     """Runs until it is stopped, or until all sources have ended; it closes its components at the end."""
 
     def __init__(
         self, config: ServiceFile, components: ServiceComponents, monotonic: Callable[[], float] = time.monotonic
     ) -> None:
-        """`monotonic`: returns the time by which turns and silences are measured [s]."""
-        self._take_components(config, components)
-        self.writer = StoreWriter(self.store, config.name, config.service.buffer)
+        """`monotonic`: as in `ServiceParts`."""
+        super().__init__(config, components, monotonic)
         self.metrics = ServiceMetrics(self)
-        self.clock = SteadyClock(monotonic)
-        self.dispatcher = OutboxDispatcher(self.store, config.name, config.actions, self.clock, config.folder)
         self._diagnosis_worker = DiagnosisWorker()
         self._diagnosis_jobs: dict[tuple[str, PendingDiagnosis], Future[StoredDiagnosis]] = {}
         self._prognosis_jobs: dict[str, Future[Prognosis]] = {}
         self._prognosis_from: dict[str, float] = {}  # by asset, before when none is asked for again, monotonic [s]
-        self._listening = ReceptionClock(monotonic())
-        self._receptions = {name: ReceptionLog(heard_before=asset.heard) for name, asset in self.assets.items()}
-        self._housekeeping = Housekeeping(self)
+        self._housekeeping = Housekeeping(self, self.metrics)
         self._next_commit = self._next_housekeeping = 0.0
         self._stopping = self._is_behind = False  # _is_behind: whether the last turn left blocks for the next
-        self._reload_from: Path | None = None
-        self.layers, self.last_turn = components.groups.layers, monotonic()  # a service that hangs is not alive
-
-    def _take_components(self, config: ServiceFile, components: ServiceComponents) -> None:
-        self.config, self._components = config, components
-        self.sources, self.store, self._publishers = components.sources, components.store, components.publishers
-        self.assets, self.notifier, self._groups = components.assets, components.notifier, components.groups
-        # those of which a full diagnosis may be pending, in order
-        self._awaiting = {name: None for name, asset in self.assets.items() if asset.pending_diagnoses}
-
-    def reload(self, path: Path) -> None:
-        """Change to what the service file says now, soon; for a signal's handler or another thread."""
-        self._reload_from = path
 
     def stop(self) -> None:
         """Stop soon; for a signal's handler or another thread. Blocks in hand are finished and committed."""
@@ -227,21 +206,6 @@ class Service:
             self.writer.add(quiet.assets[place].name, [row])
         self.writer.set_checkpoints(quiet.assets, [block.completed_at for block in quiet.blocks])
 
-    def handle_result(self, asset: Asset, result: StepResult) -> None:
-        """Store and announce what a step of an asset has led to."""
-        self.writer.add(asset.name, result.rows)
-        if not result.transitions or asset.state is None:
-            return
-        now, examination = self.clock.now(), asset.state.examination
-        for transition in result.transitions:
-            words = {name: str(getattr(transition, name)) for name in ("asset", "alarm", "before", "after")}
-            log("info", "alarm", **words, cause=transition.cause, who=transition.who, t=transition.time)
-            if transition.alarm == "fault" and transition.event == "clear":
-                rows = self.notifier.accommodate_fault(asset.name, None, transition.time, now)
-                self.writer.add(self.config.name, rows)
-        details = {"diagnosis": examination.summary, "onset": examination.onset}
-        self.writer.add(self.config.name, self.notifier.notify(result.transitions, details, now))
-
     def _run_diagnoses(self, *, ended: bool) -> None:
         """Start the full diagnoses that are due, and take the results of those that are done."""
         for name in list(self._awaiting):
@@ -283,10 +247,6 @@ class Service:
                 self.handle_result(asset, asset.apply_prognosis(prognosis))
                 self.writer.set_checkpoint(asset)
 
-    def note_refusal(self, name: str, why: str) -> None:
-        """Note that something of an asset came and could not be used."""
-        self._receptions[name].refuse(self._listening.seconds, why)
-
     def _check_reception(self) -> None:
         """Look how each asset is heard, and advance the clocks of those that are not, as fast as their samples' run."""
         if self._exhausted:
@@ -323,13 +283,6 @@ class Service:
         name, first = next(iter(lacking.items()))
         counts = {"count": len(lacking), "total": len(self.assets)}
         return render(message("service.degraded_assets", asset=name, why=first.reception.why, **counts))
-
-    @property
-    def troubles(self) -> dict[str, str]:
-        """What is wrong with the connection of each source and outlet, in words, by its name; empty: nothing."""
-        # a publisher of another package may say nothing
-        outlets = {name: str(getattr(publisher, "trouble", "")) for name, publisher in self._publishers.items()}
-        return outlets | {name: outlets.get(name, "") or source.trouble for name, source in self.sources.items()}
 
     def _commit(self) -> None:
         """Write what was gathered; what cannot be written waits."""

@@ -12,6 +12,7 @@ import numpy as np
 from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.core.errors import ServoscopeError
 from servoscope.diagnosis.monitor import Monitor
+from servoscope.service.assets.arm_monitor import AnyMonitor
 from servoscope.service.assets.asset import Asset
 from servoscope.service.assets.recent_blocks import PackedBlock
 from servoscope.service.assets.records import NextBlock, StepResult, TableRow
@@ -61,24 +62,21 @@ class AssetGroups:
 
     def __init__(self, assets: Mapping[str, Asset], layers: LayerTimes | None = None) -> None:
         self._assets, self.layers = assets, layers or LayerTimes()
-        monitors: dict[Hashable, dict[int, Monitor]] = defaultdict(dict)
-        kinds: dict[int, Hashable | None] = {}  # of the monitors, which assets share
-        for monitor in {id(asset.monitor): asset.monitor for asset in assets.values()}.values():
-            kinds[id(monitor)] = key = monitor.lane_key
-            if isinstance(monitor, Monitor) and key is not None:
-                monitors[key][id(monitor)] = monitor
-        members: dict[Hashable, list[str]] = defaultdict(list)
-        for name, asset in assets.items():
-            members[kinds[id(asset.monitor)]].append(name)
+        # of the monitors, which assets share
+        keys = {monitor: monitor.lane_key for monitor in {asset.monitor for asset in assets.values()}}
+        members: dict[Hashable, list[Asset]] = defaultdict(list)
+        for asset in assets.values():
+            members[keys[asset.monitor]].append(asset)
         self._fleets, self._places = list[_Fleet](), dict[str, _Place]()  # of assets that have company
-        for key, own in monitors.items():
-            if len(names := members[key]) > 1:
-                size = len(assets[names[0]].monitor.init())
-                baselines = {monitor: i for i, monitor in enumerate(own)}
-                for row, name in enumerate(names):
-                    asset = assets[name]
-                    self._places[name] = _Place(asset, len(self._fleets), baselines[id(asset.monitor)], row)
-                self._fleets.append(_Fleet(Monitor.join(list(own.values())), AssetStates(len(names), size)))
+        for key, together in members.items():
+            if key is None or len(together) == 1:
+                continue
+            monitors = dict.fromkeys(asset.monitor for asset in together if isinstance(asset.monitor, Monitor))
+            numbers: dict[AnyMonitor, int] = {monitor: i for i, monitor in enumerate(monitors)}
+            for row, asset in enumerate(together):
+                self._places[asset.name] = _Place(asset, len(self._fleets), numbers[asset.monitor], row)
+            states = AssetStates(len(together), len(together[0].monitor.init()))
+            self._fleets.append(_Fleet(Monitor.join(list(monitors)), states))
 
     def process(self, blocks: Iterable[Block], latest: float = np.inf) -> Iterator[BlockResult | QuietBlocks]:
         """Process blocks of any assets, those of one asset in their order; yield what they have led to.
@@ -154,10 +152,9 @@ class AssetGroups:
             group = [placed[i] for i in chosen.tolist()]
             if phase < 0 or len(group) == 1:
                 alone += [block for _, block in group]
-            elif len(group) == len(placed):
-                yield from self._process_lanes(fleet, group, rows, monitors, signals, is_new)
             else:
-                some = rows[chosen], monitors[chosen], signals[chosen], is_new[chosen]
+                which = chosen if len(group) < len(placed) else slice(None)  # which copies nothing
+                some = rows[which], monitors[which], signals[which], is_new[which]
                 yield from self._process_lanes(fleet, group, *some)
 
     def _process_lanes(

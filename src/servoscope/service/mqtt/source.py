@@ -52,11 +52,11 @@ class MqttSourceSettings(SessionSettings, SourceSettings):
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> Inbox:
         """Return the source."""
         rejections = RejectionCounter()
-        decoder: Decoder
-        if self.payload is None:
-            decoder = BlockMessages(self.topic, assets)
-        else:
-            decoder = MessageMapping.of_assets(self.payload, assets, rejections)
+        decoder: Decoder = (
+            BlockMessages(self.topic, assets)
+            if self.payload is None
+            else MessageMapping.of_assets(self.payload, assets, rejections)
+        )
         return Inbox(MqttTransport(self, folder, name), decoder, assets, rejections, self.in_flight)
 
 
