@@ -16,7 +16,6 @@ from rich.console import Console
 
 import servoscope as ss
 from golden.results import FOLDER
-from servoscope import report
 from servoscope.assessment.assess import assess
 from servoscope.cli.render import history, results
 from servoscope.cli.render.assessment import print_assessment
@@ -34,6 +33,7 @@ from servoscope.models import plants
 from servoscope.models.plants import axis
 from servoscope.prognosis.forecast import prognose
 from servoscope.prognosis.series import SizeSeries
+from servoscope.report import diagnosis_page as report
 from servoscope.report.document import DETAILS
 from servoscope.report.inspection_page import render_inspection_page
 from servoscope.service.assets.reception import Reception

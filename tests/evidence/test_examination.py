@@ -26,7 +26,7 @@ from servoscope.service.assets.examination import StoredDiagnosis, blocks_to_rec
 from servoscope.service.assets.examination_schedule import FIRST_PER_S, ExaminationState, is_at_rest, update_examination
 from servoscope.service.config import DiagnosisSettings
 from servoscope.service.sources.block import Block
-from servoscope.signals import Recording, spikes, time_axis
+from servoscope.signals import Recording, time_axis
 from servoscope.simulation import FaultEvent, reference, simulate
 
 START = 1767225600.0
@@ -132,30 +132,6 @@ def test_a_copy_takes_along_what_holds_for_it_only() -> None:
     other = baseline.model_copy(update={"loop_settings": settings | {"delay": 0.01}})
     assert other.loop.delay == 0.01 and other.pipeline() is not pipeline
     assert pickle.loads(pickle.dumps(baseline)).pipeline().every == pipeline.every
-
-
-def test_a_quiet_signal_is_known_to_have_no_spikes(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng, run = np.random.default_rng(0), np.zeros(3000, dtype=np.int32)
-    run[1500:] = 1
-    t = np.arange(3000) / 100.0
-    made = [
-        scale * np.sin(2.0 * np.pi * f * t) + level * rng.normal(size=t.size)
-        for scale, f, level in [(1.0, 0.3, 0.0), (1.0, 9.0, 0.01), (0.0, 1.0, 1.0), (1e-9, 7.0, 1e-11), (5.0, 0.2, 0.3)]
-    ]
-    made.append(np.repeat(rng.normal(size=300), 10))  # steps
-    for x in made.copy():
-        for at, width in ((700, 1), (1499, 2), (1500, 3), (0, 2), (2999, 1), (2000, 6)):
-            for height in (0.12, 0.3, 1.5, 3.0, 100.0):
-                spiky = x.copy()
-                spiky[at : at + width] += height * np.ptp(x)
-                made.append(spiky)
-    quiet = [spikes._is_quiet(x, run, 0.1) for x in made]
-    found = [spikes.find_spikes(x, run, share=0.1) for x in made]
-    stepping = [np.abs(np.diff(x)).max() > 0.1 * np.ptp(x) for x in made]
-    assert any(map(all, zip(quiet, stepping, strict=True))) and any(rows.size for rows in found)
-    monkeypatch.setattr(spikes, "_is_quiet", lambda x, run, share: False)
-    for x, rows in zip(made, found, strict=True):
-        np.testing.assert_array_equal(rows, spikes.find_spikes(x, run, share=0.1))
 
 
 @given(st.data())

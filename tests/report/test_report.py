@@ -13,7 +13,6 @@ import pytest
 import screens
 from pages import PROVENANCE, Reader, make_diagnosis, make_recording, make_trace, read
 
-from servoscope import report
 from servoscope.cli.output_paths import REPORTS, check_output
 from servoscope.core.errors import OutputError
 from servoscope.diagnosis.explanation import build_headline
@@ -22,6 +21,7 @@ from servoscope.diagnosis.result import DiagnosisWarning, FinalCoefficient
 from servoscope.isolation.candidate import Candidate, FaultEstimate
 from servoscope.models.loop import Loop
 from servoscope.report import diagnosis_figures, plotting
+from servoscope.report import diagnosis_page as report
 from servoscope.signals import clean
 
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from servoscope import report
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, FinalCoefficient, ResponsePoint
 from servoscope.estimation.frequency_response import FrequencyResponse
 from servoscope.isolation.candidate import Candidate, FaultEstimate
 from servoscope.models.loop import Loop
+from servoscope.report import diagnosis_page as report
 from servoscope.signals import Recording
 
 PROVENANCE = {"baseline": "healthy.json", "hash": "0123456789abcdef", "threshold": "46.2"}

@@ -14,9 +14,9 @@ from starlette.datastructures import Headers
 
 from servoscope.core.sandbox import Sandbox
 from servoscope.core.workers import ProcessLimits, WorkerError
+from servoscope.report.downsample import downsample_indices
 from servoscope.service.store import Batch, Store
 from servoscope.signals.readers.guess_columns import guess_mapping
-from servoscope.web.downsample import downsample_indices
 from servoscope.web.event_hub import EventHub
 from servoscope.web.jobs.queue import run_task
 from servoscope.web.middleware import request_language

@@ -84,7 +84,7 @@ def assess(
     elif ranked:
         assessment.print_ranking(out, ranked)
     if work_list is not None:
-        table, text = assessment.ranking_table(ranked), io.StringIO()
+        table, text = assessment_page.ranking_table(ranked), io.StringIO()
         csv.writer(text).writerows([table.head, *table.rows])
         atomic_write(work_list, text.getvalue().encode())
         results.print_written_path(results.create_console(stderr=as_json), work_list)

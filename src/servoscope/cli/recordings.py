@@ -267,7 +267,7 @@ def diagnose(
     from servoscope.diagnosis.diagnose import diagnose as diagnose_recording
     from servoscope.diagnosis.diagnose import diagnose_with_trace
     from servoscope.diagnosis.verify import provenance
-    from servoscope.report import document, plain_values, write_diagnosis_page
+    from servoscope.report import document, plain_values
     from servoscope.signals.writers import write_table
 
     if (of_arm := ArmBaseline.load(baseline)) is not None:
@@ -306,6 +306,8 @@ def diagnose(
                         if traces is not None and course is not None:
                             traces.write(path, recording.name, write_table, course.table(), stderr=as_json)
                         if pages is not None and course is not None:
+                            from servoscope.report.diagnosis_page import write_diagnosis_page  # late: it draws
+
                             at = learned.at(result.point) if result.point else learned
                             origin = plain_values.provenance(at, baseline, path)
                             page = result, course, recording, at.loop, origin

@@ -23,8 +23,6 @@ from servoscope.export.texts import fill_template
 from servoscope.signals.quality import QualitySettings
 from servoscope.signals.quality import kernel as quality
 
-__all__ = ["UNSEEN_MOTION", "CMonitor", "export_c"]
-
 NAME = "servo_monitor"
 SIGNAL_BYTES = 2 * 4 + 4 * 4 + 3 * 8 + 8 * (3 + 3 + 1 + 16 + 4 * 2)  # of the struct `signals` in monitor.h
 UNSEEN_MOTION = (

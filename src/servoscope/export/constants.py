@@ -21,8 +21,6 @@ from servoscope.estimation.recursion import Recursion
 from servoscope.export.image import fingerprint
 from servoscope.export.texts import plain_text
 
-__all__ = ["ExportConstants", "check_name", "common_words", "covariate_tables", "refuse_covariates"]
-
 
 @dataclass(frozen=True, eq=False)
 class ExportConstants:

@@ -20,8 +20,6 @@ from servoscope.export.c_monitor import NAME, RESPONSE, export_c
 from servoscope.export.constants import refuse_covariates
 from servoscope.export.texts import fill_template
 
-__all__ = ["export_fmu"]
-
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
 LIBRARY = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": ("windows", ".dll")}
 PROCESSORS = {"amd64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}

@@ -19,8 +19,6 @@ from servoscope.detection.statistic import apply_alarm_delays, consecutive_excee
 from servoscope.export.constants import ExportConstants
 from servoscope.signals.quality import QualityLimits, QualitySettings, check_block, init_state
 
-__all__ = ["GoldenRun", "describe_rounding", "golden_covariates", "golden_signals", "golden_words"]
-
 MIN_GOLDEN_SAMPLES, MAX_GOLDEN_SAMPLES = 2000, 20_000  # samples
 SEED = 27
 MAX_FACTOR = 1.1  # in the rate of false alarms, of single precision

@@ -15,8 +15,6 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import StateError
 
-__all__ = ["fingerprint", "pack_image", "unpack_image"]
-
 ALARM_NUMBERS = 2
 MARK_BYTES, CRC_BYTES = 8, 4
 

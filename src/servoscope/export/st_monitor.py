@@ -15,8 +15,6 @@ from servoscope.export.constants import ExportConstants, check_name, common_word
 from servoscope.export.steps import StepTexts, StepTracer, evaluation_names
 from servoscope.export.texts import fill_template
 
-__all__ = ["export_st", "save_st"]
-
 SIGNALS = {0: "signal_r", TILE: "signal_u", 2 * TILE: "signal_y"}
 # arrays of the steps -> variables of the function block
 VARIABLES = {

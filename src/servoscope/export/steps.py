@@ -15,8 +15,6 @@ from servoscope.estimation.kernel.evaluation_steps import EvaluationSteps
 from servoscope.estimation.kernel.sample_steps import SampleSteps
 from servoscope.estimation.kernel.spec import KernelSpec
 
-__all__ = ["StepTexts", "StepTracer"]
-
 DOUBLES = frozenset({"h", "status", "when", "extra"})  # arrays of doubles, whatever most numbers are
 
 StepTexts = dict[str, list[str]]

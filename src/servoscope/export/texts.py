@@ -15,8 +15,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from servoscope.core.jit.c_source import c_literal
 from servoscope.core.jit.st_source import st_literal
 
-__all__ = ["fill_template", "plain_text"]
-
 MAX_LINE = 108
 MAX_ITEMS = 24  # in a line of golden values
 

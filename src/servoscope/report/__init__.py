@@ -1,5 +1,1 @@
-"""A diagnosis as one self-contained HTML page with plots."""
-
-from servoscope.report.diagnosis_page import render_diagnosis_page, write_diagnosis_page
-
-__all__ = ["render_diagnosis_page", "write_diagnosis_page"]
+"""Results as sentences, figures and self-contained pages."""

@@ -19,6 +19,7 @@ from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import OutputError
 from servoscope.core.files import atomic_write
 from servoscope.core.messages import translate
+from servoscope.report.downsample import downsample_indices
 
 # The light side of palette.css, which reports and pages share.
 COLOURS: dict[str, str] = dict(
@@ -86,29 +87,15 @@ def envelope(
 ) -> tuple[FloatArray, FloatArray]:
     """Return a line that looks like x(t) with at most about three points per column.
 
-    Short signals are returned as they are, long ones as the smallest and largest value in each column of
-    time. NaN breaks the line where it restarts.
+    Short signals are returned as they are, long ones as the smallest and largest value in each of as many parts.
+    NaN breaks the line where it restarts.
 
     `t, x`: shape (N,); t must not fall; `restart`: true where a sample does not follow its predecessor, shape (N,).
     """
-    breaks = np.zeros(len(t), dtype=bool) if restart is None else restart.copy()
-    breaks[:1] = False
-    if len(t) <= 4 * columns:
-        at = np.flatnonzero(breaks)
-        return np.insert(t, at, t[at]), np.insert(x, at, np.nan)
-    width = (t[-1] - t[0]) / columns or 1.0
-    column = np.minimum(((t - t[0]) / width).astype(np.int64), columns - 1)
-    start = np.flatnonzero(np.diff(column, prepend=-1))
-    low = np.minimum.reduceat(np.where(np.isfinite(x), x, np.inf), start)
-    high = np.maximum.reduceat(np.where(np.isfinite(x), x, -np.inf), start)
-    empty = ~np.isfinite(low)
-    low[empty] = high[empty] = np.nan
-    # the way that the signal takes through the column: from its first value's side to the other
-    rising = x[start] - low <= high - x[start]
-    pairs = np.stack([np.where(rising, low, high), np.where(rising, high, low)], axis=1).ravel()
-    times = np.repeat(t[start], 2)
-    at = 2 * np.flatnonzero(breaks[start])
-    return np.insert(times, at, times[at]), np.insert(pairs, at, np.nan)
+    breaks = np.flatnonzero(restart[1:]) + 1 if restart is not None else np.empty(0, dtype=np.intp)
+    at = downsample_indices((x,), 2 * columns) if len(t) > 4 * columns else np.arange(len(t))
+    places, first = np.unique(np.searchsorted(at, breaks), return_index=True)
+    return np.insert(t[at], places, t[breaks[first]]), np.insert(x[at], places, np.nan)
 
 
 def visible_spans(t: FloatArray, low: FloatArray, high: FloatArray, most: int = COLUMNS) -> list[tuple[float, float]]:

@@ -20,8 +20,7 @@ NEIGHBOURS = 20  # samples on either side that define what is normal
 STEP_SHARE = 0.02  # of the reference's range: smaller steps do not make u kick
 REACTION_SAMPLES = 3  # samples in which u may kick after a step of r
 PASSES = 30
-LEVEL_SAMPLES = 500  # samples that are enough to guess two levels
-CHUNK_PLACES = 512  # that are looked at together: each of them brings the pages around it into memory
+CHUNK_PLACES = 4096  # that are looked at together: each of them brings the pages around it into memory
 
 
 def find_spikes(
@@ -43,8 +42,6 @@ def find_spikes(
     samples may jump, for example u where the reference steps.
     """
     spikes = NO_ROWS
-    if _is_quiet(x, run, share):
-        return spikes
     for _ in range(PASSES):  # spikes hide others: range and neighbours are taken again without those found
         z, runs = outofcore.drop_rows(x, spikes), outofcore.drop_rows(run, spikes)
         before = spikes - np.arange(spikes.size)
@@ -74,35 +71,6 @@ def follows_reference_step(r: FloatArray, run: npt.NDArray[np.int32], rows: Inde
             )
             kicked[places] |= (inside & (is_step | (run[at] != run[at - 1]))) | (rows[places] == offset)
     return kicked
-
-
-def _is_quiet(x: FloatArray, run: npt.NDArray[np.int32], share: float) -> bool:
-    """Return whether it is certain that there is no spike: of most signals, told in a tenth of the search's time.
-
-    More than 1 % of the samples lie beyond either of two levels, so the range of the search is no smaller than their
-    distance; what is no spike for this range is none for the search either. At the edge of a run, `MAX_WIDTH` steps
-    that are no higher than a spike must be are less than an enormous one.
-    """
-    if not 2 * NEIGHBOURS <= x.size <= outofcore.CHUNK_ROWS:
-        return False
-    some = x[:: max(1, x.size // LEVEL_SAMPLES)]
-    place = some.size // 20
-    low, high = np.partition(some, [place, some.size - 1 - place])[[place, some.size - 1 - place]].tolist()
-    enough, span = 0.01 * x.size + 1.0, high - low
-    if span <= 0.0 or min(np.count_nonzero(x <= low), np.count_nonzero(x >= high)) <= enough:
-        return False
-    steps = np.abs(x[1:] - x[:-1])
-    highest, modest, enormous = float(steps.max()), share * span, MIN_WIDE_SPIKE_FACTOR * span
-    if highest <= modest:
-        return True
-    if highest > enormous:
-        return False
-    entered = np.append(0, np.flatnonzero((steps > modest) | (run[1:] != run[:-1])) + 1)
-    for width in range(1, MAX_NORMAL_WIDTH + 1):
-        start, height = _find_excursions(x, run, entered, width, modest, enormous)
-        if (height > LOCAL_STEP_FACTOR * _local_step_quartile(x, start, np.full(start.size, width))).any():
-            return False
-    return True
 
 
 def _find_spikes_once(
@@ -145,23 +113,37 @@ def _find_spikes_once(
 def _find_excursions(
     z: FloatArray, run: npt.NDArray[np.int32], at: IndexArray, width: int, smallest: float, at_edge: float
 ) -> tuple[IndexArray, FloatArray]:
-    """Find at which places `width` samples stand above or below both neighbours: where (n,), and heights (n,)."""
-    from servoscope.signals.spike_kernels import write_excursions
+    """Find at which places `width` samples of one run stand above or below both neighbours: where, and how far, (n,).
 
-    start, height, count = np.empty(at.size, dtype=np.intp), np.empty(at.size), 0
+    They must do so by more than `smallest`; at the edge of a run, where there is one neighbour, by more than `at_edge`.
+    """
+    starts, heights, end = [at[:0]], [np.empty(0)], z.size - 1
     for places in outofcore.iter_chunks(0, at.size, z, run, at_once=CHUNK_PLACES):
-        count += write_excursions(z, run, at[places], width, smallest, at_edge, start[count:], height[count:])
-    return start[:count], height[:count]
+        first = at[places][at[places] + width - 1 <= end]
+        first = first[run[first] == run[first + width - 1]]
+        previous, following = np.maximum(first - 1, 0), np.minimum(first + width, end)
+        before = (first > 0) & (run[previous] == run[first])
+        after = (first + width <= end) & (run[following] == run[first])
+        inside = z[first[:, None] + np.arange(width)]
+        below = np.maximum(np.where(before, z[previous], -np.inf), np.where(after, z[following], -np.inf))
+        above = np.minimum(np.where(before, z[previous], np.inf), np.where(after, z[following], np.inf))
+        height = np.maximum(inside.min(axis=1) - below, above - inside.max(axis=1))
+        high = (before | after) & (height > np.where(before & after, smallest, at_edge))
+        starts.append(first[high])
+        heights.append(height[high])
+    return np.concatenate(starts), np.concatenate(heights)
 
 
 def _local_step_quartile(z: FloatArray, start: IndexArray, width: IndexArray) -> FloatArray:
-    """Upper quartile of the steps around each place, shape (n,)."""
-    from servoscope.signals.spike_kernels import write_local_steps
+    """Upper quartile of the steps around each place, shape (n,).
 
-    if start.size == 0 or z.size < 2:
-        return np.zeros(start.size)
-
-    quartile = np.empty(start.size)
-    for places in outofcore.iter_chunks(0, start.size, z, at_once=CHUNK_PLACES):
-        write_local_steps(z, start[places], width[places], np.empty(2 * NEIGHBOURS), quartile[places])
+    Mirrored at the ends, a place's own width away, so that one at the end is not compared with itself.
+    """
+    quartile, last, offset = np.zeros(start.size), z.size - 2, np.arange(-NEIGHBOURS, NEIGHBOURS)
+    for places in outofcore.iter_chunks(0, start.size if last >= 0 else 0, z, at_once=CHUNK_PLACES):
+        wide = width[places, None]
+        at = start[places, None] + offset + np.where(offset < 0, 0, wide)
+        at = np.where(at < 0, wide - at, at)
+        at = np.clip(np.where(at > last, 2 * last - at - wide, at), 0, last)
+        quartile[places] = np.quantile(np.abs(z[at + 1] - z[at]), 0.75, axis=1)
     return quartile

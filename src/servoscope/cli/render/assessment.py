@@ -15,8 +15,6 @@ from servoscope.core.messages import say, translate
 from servoscope.report.assessment_page import assessment_size, facts, index_table, ranking_table
 from servoscope.report.page import ResultTable
 
-__all__ = ["print_assessment", "print_ranking", "ranking_table"]
-
 
 def print_assessment(out: Console, a: Assessment) -> None:
     """Print verdict, probability, reason, the evidence and what to do."""

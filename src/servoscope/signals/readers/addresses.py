@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import operator
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import EntryPoint, entry_points
@@ -15,7 +16,9 @@ from urllib.parse import parse_qsl
 
 from servoscope.core.errors import RecordingError
 from servoscope.models.loop import TextLayout
-from servoscope.signals.readers.table import Table, TableFile
+from servoscope.signals.readers.table import TableFile
+
+Comparison = Callable[[Any, Any], Any]
 
 ENTRY_POINTS = "servoscope.tables"  # name is what an address begins with, object a function from address to table
 BUILT_IN = tuple(  # written like the entry points of other packages, and loaded like them
@@ -79,15 +82,15 @@ class TableAddress:
 
     def table(self, columns: Sequence[str], read: Any) -> TableFile:
         """Return a table whose chunks `read` yields, as mappings of names to Arrow columns."""
+        return TableFile(Path(self.text), tuple(columns), lambda wanted, _: read(tuple(wanted)))
 
-        def chunks(wanted: Sequence[str], _: object) -> Any:
-            first = 1
-            for chunk in read(tuple(wanted)):
-                table = Table(self.text, chunk, first)
-                yield table
-                first += table.rows
-
-        return TableFile(Path(self.text), tuple(columns), chunks)
+    def conditions(self, time: str | None) -> Iterator[tuple[str, Comparison, str]]:
+        """Yield what rows have to meet: a column, how it is compared, and with what; `time`: the time column."""
+        for column, value in self.equal.items():
+            yield column, operator.eq, value
+        for limit, compare in ((self.since, operator.ge), (self.until, operator.lt)):
+            if limit is not None and time is not None:
+                yield time, compare, limit
 
 
 def parse_address(text: str) -> TableAddress:

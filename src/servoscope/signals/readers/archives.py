@@ -128,7 +128,7 @@ def unpack(path: Path, open_plain: Callable[[Path], TableFile]) -> TableFile:
         raise RecordingError(f"{path}: cannot be unpacked ({shorten_error(error)}), pack it again") from None
 
     def read_chunks(wanted: Sequence[str], texts: Collection[str]) -> Iterator[Table]:
-        chunks = iter(table.read_chunks(wanted, texts))
+        chunks = table.tables(wanted, texts)
         while (chunk := _renamed(path, inside, lambda: next(chunks, None))) is not None:
             yield chunk
 

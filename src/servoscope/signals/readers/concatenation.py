@@ -23,7 +23,7 @@ def open_concatenation(address: TableAddress) -> TableFile:
 
     def read_chunks(wanted: Sequence[str], texts: Collection[str]) -> Iterator[Table]:
         for file in files:
-            yield from file.read_chunks(wanted, texts)
+            yield from file.tables(wanted, texts)
 
     first = files[0]
     missing = {

@@ -171,44 +171,32 @@ def read_csv(path: Path, layout: CsvLayout, wanted: Sequence[str], texts: Collec
 def _iter_text_chunks(path: Path, layout: CsvLayout) -> Iterator[tuple[bytes, int, bool]]:
     """Yield whole lines, how many lines were before them, and whether they are the last ones."""
     before, held = 0, b""
-    plain = (layout.encoding, layout.line_end, layout.comments, layout.thousands) == ("utf-8-sig", "", COMMENTS, "")
-    plain = plain and layout.delimiter != " "
-    for text in _iter_utf8(path) if plain else _iter_recoded(path, layout):
+    for text in _iter_utf8(path, layout):
         if held:
             yield held, before, False
-            before += held.count(b"\n") or held.count(b"\r")
+            before += held.count(b"\n")
         held = text
     yield held, before, True
 
 
-def _iter_utf8(path: Path) -> Iterator[bytes]:
-    with path.open("rb") as file:
-        while text := file.read(CHUNK_BYTES):
-            yield _replace_invalid(text if text.endswith(b"\n") else text + file.readline())
+def _iter_utf8(path: Path, layout: CsvLayout) -> Iterator[bytes]:
+    """Yield lines as UTF-8 with single blanks: Arrow knows no runs of them as one delimiter, and no thousands.
 
-
-def _replace_invalid(text: bytes) -> bytes:
-    """Return text with a replacement for what is none: Arrow cannot tell of rows that it cannot decode."""
-    try:
-        text.decode("utf-8")
-    except UnicodeDecodeError:
-        return text.decode("utf-8", errors="replace").encode()
-    return text
-
-
-def _iter_recoded(path: Path, layout: CsvLayout) -> Iterator[bytes]:
-    """Yield lines as UTF-8 with single blanks: Arrow knows no runs of them as one delimiter, and no thousands."""
+    What cannot be decoded is replaced: Arrow cannot tell of rows that it cannot decode.
+    """
     begin = '(?<=")' if layout.delimiter == layout.thousands else f'(?<![^"\\s{re.escape(layout.delimiter)}])'
     grouped = re.compile(rf"{begin}[-+]?\d{{1,3}}(?:{re.escape(layout.thousands)}\d{{3}})+(?!\d)")
+    by_line = layout.comments != COMMENTS or layout.line_end or layout.delimiter == " "
     with path.open(encoding=layout.encoding, errors="replace") as file:
-        while lines := file.readlines(CHUNK_BYTES):
+        while text := file.read(CHUNK_BYTES) + file.readline():
+            lines = text.split("\n") if by_line else [text]
             if layout.comments != COMMENTS:  # what the user calls a comment may have as many cells as a row
-                lines = ["\n" if line.lstrip().startswith(layout.comments) else line for line in lines]
+                lines = ["" if line.lstrip().startswith(layout.comments) else line for line in lines]
             if layout.line_end:
-                lines = [_strip_end(line, layout.line_end) + "\n" for line in lines]
+                lines = [_strip_end(line, layout.line_end) for line in lines]
             if layout.delimiter == " ":
-                lines = [re.sub(r"[ \t]+", " ", line.strip()) + "\n" for line in lines]
-            text = "".join(lines)
+                lines = [re.sub(r"[ \t]+", " ", line.strip()) for line in lines]
+            text = "\n".join(lines)
             if layout.thousands:
                 text = grouped.sub(lambda cell: cell[0].replace(layout.thousands, ""), text)
             yield text.encode()

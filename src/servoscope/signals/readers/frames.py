@@ -12,7 +12,7 @@ import numpy.typing as npt
 from servoscope.core.errors import RecordingError
 from servoscope.models.loop import TextLayout
 from servoscope.signals.readers.formats import open_file
-from servoscope.signals.readers.table import Table, TableFile, one_line_errors
+from servoscope.signals.readers.table import TableFile, one_line_errors
 
 
 class ArrowStream(Protocol):
@@ -54,5 +54,4 @@ def open_source(source: Source, text: TextLayout | None = None) -> TableFile:
 
 
 def _open_table(name: str, table: Any) -> TableFile:
-    columns = {column: table.column(column) for column in table.column_names}
-    return TableFile(Path(name), tuple(columns), lambda *_: iter([Table(name, columns)]))
+    return TableFile.from_columns(Path(name), {column: table.column(column) for column in table.column_names})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import operator
 from collections.abc import Iterator, Sequence
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -13,6 +14,7 @@ from servoscope.signals.readers.table import TableFile, one_line_errors
 
 CHUNK_ROWS = 10_000  # that the server sends at a time
 TIMEOUT_S = 60.0
+SIGNS = {operator.ge: ">=", operator.lt: "<"}
 
 
 def open_influx(address: TableAddress) -> TableFile:
@@ -24,10 +26,12 @@ def open_influx(address: TableAddress) -> TableFile:
     import pyarrow as pa
 
     measurement = address.place.partition("/")[2]
-    where = [f"{_quote(tag)} = '{_escape(value)}'" for tag, value in address.equal.items()]
-    for value, sign in ((address.since, ">="), (address.until, "<")):
-        if value is not None:
-            where.append(f"time {sign} '{address.moment(value):%Y-%m-%dT%H:%M:%S.%fZ}'")
+    where = [
+        f"{_quote(tag)} = '{_escape(value)}'"
+        if compare is operator.eq
+        else f"time {SIGNS[compare]} '{address.moment(value):%Y-%m-%dT%H:%M:%S.%fZ}'"
+        for tag, compare, value in address.conditions("time")
+    ]
     query = f"SELECT * FROM {_quote(measurement)}" + (f" WHERE {' AND '.join(where)}" if where else "")
     first = next(_answer(address, f"{query} LIMIT 1"), None)
     if first is None:
@@ -38,8 +42,7 @@ def open_influx(address: TableAddress) -> TableFile:
         for series in _answer(address, query):
             columns = dict(zip(series["columns"], zip(*series["values"], strict=True), strict=True))
             yield {
-                name: pa.chunked_array([pa.array(columns[name], pa.timestamp("ns", "UTC") if name == "time" else None)])
-                for name in wanted
+                name: pa.array(columns[name], pa.timestamp("ns", "UTC") if name == "time" else None) for name in wanted
             }
 
     return address.table(names, read)

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import operator
 import re
 from collections.abc import Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.dataset as ds
+
 from servoscope.signals.readers.addresses import TableAddress
 from servoscope.signals.readers.table import TableFile, one_line_errors
+
+ICEBERG_COMPARISONS = {operator.eq: "EqualTo", operator.ge: "GreaterThanOrEqual", operator.lt: "LessThan"}
 
 
 def open_delta(address: TableAddress) -> TableFile:
@@ -23,15 +29,9 @@ def open_delta(address: TableAddress) -> TableFile:
     time = address.time_column(rows.schema.names)
 
     def read(wanted: Sequence[str]) -> Iterator[dict[str, Any]]:
-        import pyarrow.dataset as ds
-
         chosen: Any = ds.scalar(True)
-        for column, value in address.equal.items():
-            chosen &= ds.field(column) == _scalar(address, rows.schema.field(column).type, value)
-        for limit, after in ((address.since, True), (address.until, False)):
-            if limit is not None and time is not None:
-                bound = _scalar(address, rows.schema.field(time).type, limit)
-                chosen &= ds.field(time) >= bound if after else ds.field(time) < bound
+        for column, compare, value in address.conditions(time):
+            chosen &= compare(ds.field(column), _scalar(address, rows.schema.field(column).type, value))
         with one_line_errors(*unreadable):
             arrow = rows.to_table(columns=_with_time(wanted, time), filter=chosen)
         yield _ordered(arrow, wanted, time)
@@ -54,14 +54,9 @@ def open_iceberg(address: TableAddress) -> TableFile:
 
     def read(wanted: Sequence[str]) -> Iterator[dict[str, Any]]:
         chosen: Any = expressions.AlwaysTrue()
-        for column, value in address.equal.items():
-            chosen = expressions.And(chosen, expressions.EqualTo(column, value))
-        for limit, compare in (
-            (address.since, expressions.GreaterThanOrEqual),
-            (address.until, expressions.LessThan),
-        ):
-            if limit is not None and time is not None:
-                chosen = expressions.And(chosen, compare(time, _bound(address, table, time, limit)))
+        for column, compare, value in address.conditions(time):
+            bound = value if compare is operator.eq else _bound(address, table, column, value)
+            chosen = expressions.And(chosen, getattr(expressions, ICEBERG_COMPARISONS[compare])(column, bound))
         with one_line_errors(*unreadable):
             arrow = table.scan(row_filter=chosen, selected_fields=tuple(_with_time(wanted, time))).to_arrow()
         yield _ordered(arrow, wanted, time)
@@ -107,8 +102,6 @@ def _ordered(table: Any, wanted: Sequence[str], time: str | None) -> dict[str, A
 
 
 def _scalar(address: TableAddress, kind: Any, value: str) -> Any:
-    import pyarrow as pa
-
     with one_line_errors(address.text, f"{value!r} does not go with the column", kinds=(pa.ArrowException,)):
         if pa.types.is_timestamp(kind):
             moment = address.moment(value)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.table import Table, TableFile
+from servoscope.signals.readers.table import TableFile
 from servoscope.signals.readers.units import with_unit
 
 # Names of its columns, in small letters without blanks and underscores. Sources: InfluxData, "Annotated CSV"; Siemens,
@@ -75,7 +75,7 @@ def widen(opened: TableFile) -> TableFile:
         signals[with_unit(names[code], unit)] = row[mine], values[mine]
     time = "time [s]" if DAY_COLUMN in plain else roles["time"]
 
-    def read_chunks(wanted: Sequence[str], _: Collection[str]) -> Iterator[Table]:
+    def read_chunks(wanted: Sequence[str], _: Collection[str]) -> Iterator[Mapping[str, Any]]:
         import pyarrow as pa
 
         used = {name: signals[name] for name in wanted if name != time}
@@ -84,8 +84,8 @@ def widen(opened: TableFile) -> TableFile:
         for name, (places, numbers) in used.items():
             full = np.full(len(stamps), np.nan)
             full[places] = numbers
-            cells[name] = pa.array(full[rows])
-        yield Table(opened.name, {name: pa.chunked_array([cells[name]]) for name in wanted})
+            cells[name] = full[rows]
+        yield cells
 
     return replace(opened, columns=(time, *signals), read_chunks=read_chunks, channel_groups=())
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.table import Table, TableFile, one_line_errors
+from servoscope.signals.readers.table import TableFile, one_line_errors
 from servoscope.signals.readers.units import split_unit, with_unit
 
 IN_OTHER_FILE = "lies in another file, which is not read: save all data in one file"
@@ -30,17 +30,15 @@ def open_hdf5(path: Path) -> TableFile:
 
 def _open_variables(path: Path, kind: str, load: Callable[[Path], Mapping[str, Any]]) -> TableFile:
     """Open a file whose variables are read at once."""
-    import pyarrow as pa
-
     with one_line_errors(path, f"is a damaged or unknown {kind} file", "save it again"):
         variables = dict(_flatten(load(path)))
     lengths = [x.size for x in variables.values() if x.size > 1]
     # The channels are the vectors of the length that most of them, and of those the longest, have.
     rows = max(lengths, key=lambda size: (lengths.count(size), size), default=0)
-    columns = {name: pa.chunked_array([x]) for name, x in variables.items() if x.size == rows}
+    columns = {name: x for name, x in variables.items() if x.size == rows}
     others = {name: f"has {x.size} values, the channels have {rows}" for name, x in variables.items() if x.size != rows}
     aliases = {bare: name for name in columns if (bare := split_unit(name)[0]) not in columns}
-    return TableFile(path, tuple(columns), lambda *_: iter([Table(path.name, columns)]), others, aliases=aliases)
+    return TableFile.from_columns(path, columns, non_channels=others, aliases=aliases)
 
 
 def _load_mat(path: Path) -> dict[str, Any]:

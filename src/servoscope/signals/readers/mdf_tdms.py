@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.table import CHUNK_ROWS, Table, TableFile, one_line_errors
+from servoscope.signals.readers.table import CHUNK_ROWS, TableFile, one_line_errors
 from servoscope.signals.readers.units import with_unit
 
 DEFAULT_TIME_NAME = "time"  # of a raster whose clock has no name
@@ -159,9 +159,7 @@ def _open_measurement(
 ) -> TableFile:
     damaged = path, f"is a damaged {kind} file", "export it again"
 
-    def read_chunks(wanted: Sequence[str], _: Collection[str]) -> Iterator[Table]:
-        import pyarrow as pa
-
+    def read_chunks(wanted: Sequence[str], _: Collection[str]) -> Iterator[Mapping[str, Any]]:
         raster = next(raster for raster in rasters if {*wanted} <= {*raster.places})
         with one_line_errors(*damaged), opened() as file:
             for first in range(0, raster.rows, CHUNK_ROWS):
@@ -169,8 +167,7 @@ def _open_measurement(
                 cells = {name: np.asarray(x) for name, x in read(file, raster, wanted, first, rows).items()}
                 if len({x.shape[0] for x in cells.values()}) > 1:
                     raise ValueError("channels end before their raster does")
-                columns = {name: pa.chunked_array([_arrow_values(x)]) for name, x in cells.items()}
-                yield Table(path.name, columns, first + 1)
+                yield {name: _arrow_values(x) for name, x in cells.items()}
 
     with one_line_errors(*damaged), opened() as file:
         rasters = [raster for raster in list_rasters(file) if raster.rows]

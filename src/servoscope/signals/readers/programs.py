@@ -13,7 +13,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import RecordingError
 from servoscope.signals.readers.clock import is_clock
 from servoscope.signals.readers.layout import HEAD_ROWS, check_names, find_table
-from servoscope.signals.readers.table import Table, TableFile, check_width, is_number, one_line_errors, shorten_error
+from servoscope.signals.readers.table import TableFile, check_width, is_number, one_line_errors, shorten_error
 
 
 def open_sheet(path: Path) -> TableFile:
@@ -36,8 +36,6 @@ def open_sheet(path: Path) -> TableFile:
 
 def _find_sheet_table(path: Path, rows: Sequence[Sequence[Any]]) -> TableFile | None:
     """Return the table of a sheet, None if it has none."""
-    import pyarrow as pa
-
     head = [[_cell_text(cell) for cell in row] for row in rows[:HEAD_ROWS]]
     table = find_table([row if any(row) else [] for row in head], str(path))
     if table is None:
@@ -45,11 +43,11 @@ def _find_sheet_table(path: Path, rows: Sequence[Sequence[Any]]) -> TableFile | 
     check_width(path, len(table.names))
     body = rows[table.first :]
     columns = {
-        name: pa.chunked_array([_sheet_column([row[index] if index < len(row) else "" for row in body])])
+        name: _sheet_column([row[index] if index < len(row) else "" for row in body])
         for index, name in enumerate(table.names)
         if name
     }
-    return TableFile(path, tuple(columns), lambda *_: iter([Table(path.name, columns, table.first + 1)]))
+    return TableFile.from_columns(path, columns)
 
 
 def _cell_text(cell: Any) -> str:
@@ -80,7 +78,6 @@ def open_lvm(path: Path) -> TableFile:
     Source: National Instruments, "Specification for the LabVIEW Measurement File (.lvm)".
     """
     import lvm_read
-    import pyarrow as pa
 
     with one_line_errors(path, "is a damaged LVM file", "write it again, or save it as text"):
         read = lvm_read.read(str(path), read_from_pickle=False, dump_file=False)
@@ -98,5 +95,4 @@ def open_lvm(path: Path) -> TableFile:
     values = [name for name in channels if name != "X_Value"]
     named = {"X_Value": "time", **{n: f"{n} [{u}]" for n, u in zip(values, units, strict=False) if str(u).strip()}}
     check_names([named.get(name, name) for name in channels], str(path))
-    columns = {named.get(name, name): pa.chunked_array([np.ascontiguousarray(x)]) for name, x in channels.items()}
-    return TableFile(path, tuple(columns), lambda *_: iter([Table(path.name, columns)]))
+    return TableFile.from_columns(path, {named.get(name, name): x for name, x in channels.items()})

@@ -6,7 +6,7 @@ import atexit
 import importlib
 import os
 import weakref
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 from servoscope.core.errors import RecordingError
 from servoscope.core.sandbox import Sandbox
 from servoscope.core.workers import ProcessLimits, Progress, WorkerError, Workers
-from servoscope.signals.readers.table import Table, TableFile
+from servoscope.signals.readers.table import TableFile
 
 BASE_S, BYTES_PER_S = 15.0, 5e5  # that a small file may take, and what is larger, by the clock on the wall
 LIMITS = ProcessLimits(cpu_s=1e6, memory_mb=8000.0, file_mb=1e6)  # a task's time is bound, not the process's
@@ -58,17 +58,14 @@ def open_bounded(path: Path, kind: str, module: str, function: str, library: str
             raise RecordingError(answer["error"])
         return answer
 
-    def read_chunks(wanted: Sequence[str], texts: Collection[str]) -> Iterator[Table]:
+    def read_chunks(wanted: Sequence[str], texts: Collection[str]) -> Iterator[Mapping[str, Any]]:
         import pyarrow as pa
 
         run("extract_rows", list(wanted), list(texts), str(target))
-        first = 1
         with pa.OSFile(str(target)) as source:
             target.unlink()
             for batch in pa.ipc.open_stream(source):
-                columns = {name: pa.chunked_array([batch.column(name)]) for name in batch.schema.names}
-                yield Table(path.name, columns, first)
-                first += batch.num_rows
+                yield dict(zip(batch.schema.names, batch.columns, strict=True))
 
     weakref.finalize(read_chunks, folder.cleanup)
     description = run("describe_file")
@@ -97,7 +94,7 @@ def extract_rows(
     writer = schema = None
     with pa.OSFile(target, "wb") as sink:
         try:
-            for table in _open(module, function, path).read_chunks(wanted, texts):
+            for table in _open(module, function, path).tables(wanted, texts):
                 rows = pa.table(table.columns)
                 if writer is None:
                     schema = rows.schema

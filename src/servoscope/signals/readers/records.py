@@ -12,8 +12,11 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.feather as pf
+import pyarrow.json as pj
 
-from servoscope.signals.readers.table import CHUNK_ROWS, Table, TableFile, check_width, one_line_errors
+from servoscope.signals.readers.table import CHUNK_ROWS, TableFile, check_width, one_line_errors
 from servoscope.signals.readers.topics import MAX_ARRAY_LENGTH, open_bag
 
 MAX_DEPTH = 6  # of records within records
@@ -21,9 +24,6 @@ MAX_DEPTH = 6  # of records within records
 
 def open_json(path: Path) -> TableFile:
     """Open records, one per line or in a list, or a mapping of names to lists; records within records are flattened."""
-    import pyarrow as pa
-    import pyarrow.json as pj
-
     kinds = pa.ArrowException, ValueError, TypeError, AttributeError, RecursionError
     with one_line_errors(path, "is no table in JSON", "write one record per line", kinds):
         with path.open("rb") as file:
@@ -41,16 +41,11 @@ def open_json(path: Path) -> TableFile:
 
 def open_records(path: Path, records: Sequence[Mapping[str, Any]]) -> TableFile:
     """Open a list of records."""
-    import pyarrow as pa
-
     return _open_frame(path, pa.Table.from_pylist(records))
 
 
 def open_feather(path: Path) -> TableFile:
     """Open a Feather file, which is Arrow's own format."""
-    import pyarrow as pa
-    import pyarrow.feather as pf
-
     kinds = pa.ArrowException, OSError, ValueError
     with one_line_errors(path, "is a damaged Feather file", "write it again", kinds):
         return _open_frame(path, pf.read_table(path, memory_map=False))
@@ -58,8 +53,6 @@ def open_feather(path: Path) -> TableFile:
 
 def open_numpy(path: Path) -> TableFile:
     """Open arrays of NumPy, ``.npz`` or ``.npy``: columns by name, fields of records, or columns of a matrix."""
-    import pyarrow as pa
-
     with one_line_errors(path, "holds no plain arrays", "save columns of numbers"), path.open("rb") as file:
         loaded = np.load(file, allow_pickle=False)
         arrays = {"": loaded} if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
@@ -97,15 +90,14 @@ def open_sqlite(path: Path) -> TableFile:
     }
     check_width(path, len(places))
 
-    def read_chunks(wanted: Sequence[str], _: Collection[str]) -> Iterator[Table]:
+    def read_chunks(wanted: Sequence[str], _: Collection[str]) -> Iterator[Mapping[str, Any]]:
         table = places[wanted[0]][0]  # that of all of them
         query = f"SELECT {', '.join(_quote(places[name][1]) for name in wanted)} FROM {_quote(table)}"
         with one_line_errors(*damaged), closing(_connect(path)) as database:
-            rows, first = database.execute(query), 1
+            rows = database.execute(query)
             while piece := rows.fetchmany(CHUNK_ROWS):
                 cells = zip(wanted, zip(*piece, strict=True), strict=True)
-                yield Table(path.name, {name: _cell_column(column) for name, column in cells}, first)
-                first += len(piece)
+                yield {name: _cell_column(column) for name, column in cells}
 
     groups = tuple(tuple(name for name, (table, _) in places.items() if table == label) for label in tables)
     return TableFile(path, tuple(places), read_chunks, channel_groups=groups)
@@ -126,18 +118,14 @@ def _column_names(database: sqlite3.Connection, table: str) -> list[str]:
 
 def _cell_column(cells: Sequence[Any]) -> Any:
     """Return cells as Arrow takes them: numbers where there is nothing else, else text."""
-    import pyarrow as pa
-
     if all(cell is None or isinstance(cell, int | float) for cell in cells):
         whole = all(cell is None or isinstance(cell, int) for cell in cells)
-        return pa.chunked_array([pa.array(cells, pa.int64() if whole else pa.float64())])
-    return pa.chunked_array([pa.array([None if cell is None else str(cell) for cell in cells], pa.string())])
+        return pa.array(cells, pa.int64() if whole else pa.float64())
+    return pa.array([None if cell is None else str(cell) for cell in cells], pa.string())
 
 
 def _open_frame(path: Path, table: Any, others: Mapping[str, str] | None = None) -> TableFile:
     """Return a table of Arrow, records and short lists in its cells flattened."""
-    import pyarrow as pa
-
     for _ in range(MAX_DEPTH):
         table = table.flatten()
     columns: dict[str, Any] = {}
@@ -149,9 +137,8 @@ def _open_frame(path: Path, table: Any, others: Mapping[str, str] | None = None)
                 cells = [
                     cell if cell is not None and len(cell) == width else [None] * width for cell in column.to_pylist()
                 ]
-                columns |= {f"{name}[{k}]": pa.chunked_array([pa.array([c[k] for c in cells])]) for k in range(width)}
+                columns |= {f"{name}[{k}]": pa.array([c[k] for c in cells]) for k in range(width)}
         else:
             columns[name] = column
     check_width(path, len(columns))
-    read = lambda wanted, _: iter([Table(path.name, {name: columns[name] for name in wanted})])  # noqa: E731
-    return TableFile(path, tuple(columns), read, dict(others or {}))
+    return TableFile.from_columns(path, columns, non_channels=dict(others or {}))

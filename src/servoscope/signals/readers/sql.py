@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,19 +29,15 @@ def open_sql(address: TableAddress) -> TableFile:
 
     def read(wanted: Sequence[str]) -> Iterator[dict[str, Any]]:
         query = sa.select(*(table.c[name] for name in wanted))
-        for column, value in address.equal.items():
-            query = query.where(table.c[column] == _typed(address, table.c[column], value))
+        for column, compare, value in address.conditions(time):
+            bound = _typed(address, table.c[column], value, limit=compare is not operator.eq)
+            query = query.where(compare(table.c[column], bound))
         if time is not None:
             query = query.order_by(table.c[time])
-        for limit, after in ((address.since, True), (address.until, False)):
-            if limit is not None and time is not None:
-                bound = _typed(address, table.c[time], limit, limit=True)
-                query = query.where(table.c[time] >= bound if after else table.c[time] < bound)
         with _connect(address, url) as opened:
             rows = opened.execution_options(stream_results=True).execute(query)
             for part in rows.partitions(CHUNK_ROWS):
-                columns = zip(wanted, zip(*part, strict=True), strict=True)
-                yield {name: pa.chunked_array([pa.array(values)]) for name, values in columns}
+                yield dict(zip(wanted, map(pa.array, zip(*part, strict=True)), strict=True))
 
     return address.table([column.name for column in table.c], read)
 

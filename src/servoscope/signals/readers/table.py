@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
@@ -222,12 +222,17 @@ class TableFile:
     path: Path
     columns: tuple[str, ...]  # names of its columns
     # takes names of columns, and names of those among them that are text even where they look like numbers; returns
-    # the rows chunk by chunk
-    read_chunks: Callable[[Sequence[str], Collection[str]], Iterator[Table]]
+    # the rows chunk by chunk, each as a mapping of names to columns of NumPy or Arrow, or as a table
+    read_chunks: Callable[[Sequence[str], Collection[str]], Iterator[Table | Mapping[str, Any]]]
     non_channels: dict[str, str] = field(default_factory=dict)  # variables that are no channels, and why
     channel_groups: tuple[tuple[str, ...], ...] = ()  # which columns can be read at once; empty: all of them
     # columns under the names that the file gives them, where their units stand apart: Position, for Position [mm]
     aliases: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def from_columns(cls, path: Path, columns: Mapping[str, Any], **about: Any) -> TableFile:
+        """Return a file whose columns have been read; what it is `about` are the other fields."""
+        return cls(path, tuple(columns), lambda wanted, _: iter([{name: columns[name] for name in wanted}]), **about)
 
     @property
     def name(self) -> str:
@@ -238,6 +243,21 @@ class TableFile:
     def known(self) -> tuple[str, ...]:
         """All names by which its columns may be called."""
         return (*self.columns, *self.aliases)
+
+    def tables(self, wanted: Sequence[str], texts: Collection[str] = ()) -> Iterator[Table]:
+        """Yield the rows chunk by chunk as tables; arguments as for `read_chunks`."""
+        import pyarrow as pa
+
+        first = 1
+        for chunk in self.read_chunks(wanted, texts):
+            if isinstance(chunk, Table):
+                yield chunk
+                continue
+            columns = {
+                name: x if isinstance(x, pa.ChunkedArray) else pa.chunked_array([x]) for name, x in chunk.items()
+            }
+            yield (table := Table(self.name, columns, first))
+            first += table.rows
 
     def iter_chunks(self, wanted: Collection[str], texts: Collection[str] = ()) -> Iterator[Table]:
         """Yield the rows chunk by chunk, of the columns that are wanted; `texts` among them are text in any case.
@@ -251,7 +271,7 @@ class TableFile:
         if apart := sorted(places - together):
             others = ", ".join(sorted(places & together))
             raise RecordingError(f"{self.path}: {apart[0]!r} was not sampled together with {others}: {SAMPLE_TOGETHER}")
-        for table in self.read_chunks([name for name in self.columns if name in places], texts):
+        for table in self.tables([name for name in self.columns if name in places], texts):
             if part is not None and rows >= part.rows:
                 part.cut[self.name] = rows
                 break

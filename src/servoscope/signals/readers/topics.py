@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.table import Table, TableFile, check_width, one_line_errors
+from servoscope.signals.readers.table import TableFile, check_width, one_line_errors
 
 MAX_VALUES = 200_000_000  # of all topics together, which are held in memory
 MAX_ARRAY_LENGTH = 64  # values of one field, such as the joints of a robot; images and scans have more
@@ -114,16 +114,10 @@ def open_ulog(path: Path) -> TableFile:
 def _open_topics(path: Path, topics: Topics) -> TableFile:
     """Return topics as rasters; where there is one only, its fields need no prefix."""
     full = {topic: fields for topic, fields in topics.items() if len(fields) > 1 and len(fields["time"])}
-    columns = {
-        f"{topic}.{name}" if len(full) > 1 else name: (topic, name) for topic, fields in full.items() for name in fields
-    }
+    rasters = [
+        {f"{topic}.{name}" if len(full) > 1 else name: x for name, x in fields.items()}
+        for topic, fields in full.items()
+    ]
+    columns = {label: x for raster in rasters for label, x in raster.items()}
     check_width(path, len(columns))
-    groups = tuple(tuple(label for label, (of, _) in columns.items() if of == topic) for topic in full)
-
-    def read_chunks(wanted: Sequence[str], _: Collection[str]) -> Iterator[Table]:
-        import pyarrow as pa
-
-        values = {label: full[columns[label][0]][columns[label][1]] for label in wanted}
-        yield Table(path.name, {label: pa.chunked_array([np.ascontiguousarray(x)]) for label, x in values.items()})
-
-    return TableFile(path, tuple(columns), read_chunks, channel_groups=groups)
+    return TableFile.from_columns(path, columns, channel_groups=tuple(map(tuple, rasters)))

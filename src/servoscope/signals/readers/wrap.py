@@ -23,7 +23,7 @@ class Unwrapper:
     """Unwraps a column piece by piece; a first value in the last quarter of the range counts as negative."""
 
     def __init__(self, period: float) -> None:
-        self._period, self._last, self._offset = period, math.nan, 0.0
+        self._period, self._last = period, math.nan  # the last value without jumps
         self._piece: Table | None = None
         self._found = np.zeros(0)
 
@@ -36,12 +36,9 @@ class Unwrapper:
         unwrapped = x.copy()
         if known.size:
             if math.isnan(self._last):
-                self._last = float(x[known[0]])
-                self._offset = -self._period if self._last > SIGNED_WORD_SHARE * self._period else 0.0
-            steps = np.diff(x[known], prepend=self._last)
-            turns = self._offset - self._period * np.cumsum(np.round(steps / self._period))
-            unwrapped[known] += turns
-            self._last, self._offset = float(x[known[-1]]), float(turns[-1])
+                self._last = float(x[known[0]]) - self._period * (x[known[0]] > SIGNED_WORD_SHARE * self._period)
+            unwrapped[known] = np.unwrap(np.append(self._last, x[known]), period=self._period)[1:]
+            self._last = float(unwrapped[known[-1]])
         self._found = unwrapped
         return unwrapped
 

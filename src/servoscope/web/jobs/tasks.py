@@ -34,6 +34,7 @@ from servoscope.learning import inspection
 from servoscope.learning.proposal import init
 from servoscope.models.loop import Columns, Loop
 from servoscope.report import plain_values
+from servoscope.report.downsample import downsample_indices, json_numbers, signal_columns
 from servoscope.service.renewal import read_stretch
 from servoscope.signals import Recording, readers
 from servoscope.signals.readers.arm_log import read_arm_log
@@ -41,7 +42,6 @@ from servoscope.signals.readers.axes import find_axes, signal_names
 from servoscope.signals.readers.formats import open_file
 from servoscope.signals.readers.guess_columns import guess_mapping
 from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD
-from servoscope.web.downsample import downsample_indices, json_numbers, signal_columns
 from servoscope.web.schemas import requests
 from servoscope.web.schemas.responses import JsonObject
 
@@ -145,7 +145,7 @@ def diagnose_file(
     progress: Progress, file: str, request: requests.DiagnosisRequest, baseline_file: str, name: str, out: str
 ) -> JsonObject:
     """Diagnose a recording with a baseline, for users `name`; data and report go into the folder `out`."""
-    from servoscope import report
+    from servoscope.report.diagnosis_page import write_diagnosis_page
 
     if (of_arm := ArmBaseline.load(baseline_file)) is not None:
         return _diagnose_arm(file, request, of_arm, name, Path(out))
@@ -157,7 +157,7 @@ def diagnose_file(
     progress("report")
     used = baseline.at(diagnosis.point) if diagnosis.point else baseline
     origin = plain_values.provenance(used, Path(name), Path(file))
-    report.write_diagnosis_page(Path(out) / "report.html", diagnosis, trace, recording, used.loop, origin)
+    write_diagnosis_page(Path(out) / "report.html", diagnosis, trace, recording, used.loop, origin)
     plant = used.loop.plant
     data = {
         "document": diagnosis.model_dump(mode="json"),

@@ -13,6 +13,7 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 from servoscope.core.errors import BaselineError, LoopError, StoreError, StoreUnavailableError
 from servoscope.design.operating_limits import OperatingLimit, operating_limits
 from servoscope.prognosis.forecast import prognose
+from servoscope.report.downsample import signal_columns
 from servoscope.service.asset_link import page_address, qr_code
 from servoscope.service.assets.status import AssetStatus
 from servoscope.service.sources.block import Block
@@ -23,7 +24,6 @@ from servoscope.service.store.series import FAULT_KINDS, query_sizes, read_notes
 from servoscope.web.asset_document import has_open_fault
 from servoscope.web.checks import asset_checks, asset_loop, fault_checks, last_full_diagnosis
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
-from servoscope.web.downsample import signal_columns
 from servoscope.web.routes.baselines import asset_baseline_id, find_baseline, load_cached, load_loop_baseline
 from servoscope.web.schemas import assets as schemas
 from servoscope.web.schemas import responses
