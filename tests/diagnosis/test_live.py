@@ -287,9 +287,9 @@ class TestAsset:
         for block in blocks(halls.recorded(1)):
             followed.process(block)
         assert followed.state is not None
-        assert followed.status(followed.state).to_json()["verdict"] == "healthy"
+        assert followed.status(followed.state)["verdict"] == "healthy"
         told = [one for quiet in range(1, 40) for one in followed.advance_time(float(quiet)).transitions]
-        status = followed.status(followed.state).to_json()
+        status = followed.status(followed.state)
         assert status["verdict"] == "undetermined" and "silent" in status["quality"]
         (alarm,) = [one for one in told if one.after is LifecycleState.UNACKNOWLEDGED]
         assert (alarm.alarm, alarm.cause) == ("data_quality", "no data come")
@@ -327,7 +327,7 @@ class TestAsset:
         assert [news for _, news, _ in told] == [True, False, False]  # the same fault: nobody is told once more
         assert [size for *_, size in told] == pytest.approx([1.2, 1.2, 1.6], abs=0.01)
         assert followed.state is not None
-        status = followed.status(followed.state).to_json()
+        status = followed.status(followed.state)
         (fault,) = status["faults"]
         assert (
             status["summary"] == status["alarms"]["fault"]["cause"] and "leakage has risen by 60 %" in status["summary"]
@@ -341,7 +341,7 @@ class TestAsset:
         # once it has gone the alarm still says what it was
         for block in blocks(halls.recorded(1, seconds=120.0)):
             followed.process(replace(block, sequence=block.sequence + 1000, t=block.t + 401.0))
-        status = followed.status(followed.state).to_json()
+        status = followed.status(followed.state)
         assert status["verdict"] == "healthy" and status["summary"].startswith("Healthy")
         assert status["alarms"]["fault"]["state"] == "latched_unacknowledged"
         assert "leakage has risen by 60 %" in status["alarms"]["fault"]["cause"]

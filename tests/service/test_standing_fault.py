@@ -21,6 +21,7 @@ from servoscope.service.assets.examination_schedule import (
     accept_diagnosis,
     update_examination,
 )
+from servoscope.service.assets.status import AssetStatus
 from servoscope.service.config import DiagnosisSettings
 from servoscope.service.sources.block import Block
 from servoscope.signals.quality import QualitySettings
@@ -87,11 +88,11 @@ def leaky() -> Asset:
 
 def test_when_data_stop_the_fault_is_told_with_its_age(leaky: Asset) -> None:
     assert leaky.state is not None
-    before = leaky.status(leaky.state)
+    before = AssetStatus.model_validate(leaky.status(leaky.state))
     assert before.verdict == "fault" and before.faults[0].name == "leakage"
     for seconds in (30.0, 300.0, 7200.0):
         leaky.advance_time(seconds)
-    after = leaky.status(leaky.state)
+    after = AssetStatus.model_validate(leaky.status(leaky.state))
     assert after.verdict == "fault" and after.faults == before.faults and "silent" in after.quality
     assert after.summary.startswith(before.summary) and after.summary.endswith("Now: Undetermined: no data come.")
     assert "Last seen at 2026-01-01 00:0" in after.summary

@@ -268,7 +268,7 @@ def test_metrics_are_read_at_any_moment_of_a_turn(monitors: list[Monitor], monke
     assert b'servoscope_blocks_total{asset="asset2"} 30.0' in text
     (verdicts,) = (one for one in text_string_to_metric_families(text.decode()) if one.name == "servoscope_verdict")
     shown = {one.labels["asset"]: one.labels["verdict"] for one in verdicts.samples}
-    assert shown == {name: one.status(one.state).verdict for name, one in together.items() if one.state is not None}
+    assert shown == {name: one.status(one.state)["verdict"] for name, one in together.items() if one.state is not None}
     before = [weakref.ref(one) for one in states._evaluations if one is not None]
     for asset in together.values():
         asset.take_state()  # as of one that falls silent

@@ -153,8 +153,13 @@ class StoreWriter:
         for name in [*self._urgent, *islice(waiting, count)]:
             asset = self._checkpoints.pop(name)
             state, batch.first_needed[name] = asset.renew_record(), asset.first_needed_sequence
-            row = {"asset": name, "sequence": state.position.sequence, "state": pack_state(state)}
-            batch.checkpoints[name] = {**row, "status": asset.status(state).to_json(), "at": time.time()}
+            batch.checkpoints[name] = {
+                "asset": name,
+                "sequence": state.position.sequence,
+                "state": pack_state(state),
+                "status": asset.status(state),
+                "at": time.time(),
+            }
         self._urgent = set()
         batch.bundles = self._bundles.advance(self._gathered.samples, batch.first_needed)
         self._gathered.samples = []

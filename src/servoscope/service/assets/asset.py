@@ -46,7 +46,7 @@ from servoscope.service.assets.records import (
     transition_row,
 )
 from servoscope.service.assets.states import AssetStates, RestPeriod, StateHolder
-from servoscope.service.assets.status import Announcement, AssetStatus, asset_metadata, asset_status
+from servoscope.service.assets.status import Announcement, asset_metadata, asset_status
 from servoscope.service.clock import LayerTimes
 from servoscope.service.config import DiagnosisSettings
 from servoscope.service.sources.block import Block
@@ -173,8 +173,8 @@ class Asset(StateHolder):
         """Wait for the first block from `now` [UTC s] on: an asset that was never heard has a state too."""
         self.begin(StreamPosition(now, now, rows=self.state.position.rows if self.state is not None else 0))
 
-    def status(self, state: AssetState) -> AssetStatus:
-        """Return what users see of a state."""
+    def status(self, state: AssetState) -> dict[str, Any]:
+        """Return what users see of a state, as stored."""
         about = self.alarms.definitions, self._metadata, self.reception, self.alarms.announced
         return asset_status(state, *about, self.policy.diagnosis.kept_s)
 

@@ -1,6 +1,6 @@
 """What users see of an asset and of the service: the status that is stored beside each checkpoint.
 
-`model_validate` reads a stored status, of any version; `to_json` returns what is stored.
+`model_validate` reads a stored status, of any version; `asset_status` and `to_json` return what is stored.
 """
 
 from __future__ import annotations
@@ -152,8 +152,8 @@ def read_status(stored: Mapping[str, Any]) -> AssetStatus | ServiceStatus:
     return (ServiceStatus if stored.get("service") else AssetStatus).model_validate(stored)
 
 
-def asset_metadata(baseline: AnyBaseline, group: str, window_s: float, source: str = "") -> AssetMetadata:
-    """Return the metadata of an asset with this baseline."""
+def asset_metadata(baseline: AnyBaseline, group: str, window_s: float, source: str = "") -> dict[str, Any]:
+    """Return the metadata of an asset with this baseline, as stored."""
     kind: dict[str, Any] = {"plant": "arm", "faults": {name: name for name in baseline.fault_names}}
     if isinstance(baseline, ArmBaseline):
         kind["coefficient_units"] = baseline.coefficient_units
@@ -170,7 +170,7 @@ def asset_metadata(baseline: AnyBaseline, group: str, window_s: float, source: s
         sample_rate_hz=baseline.loop.sample_rate,
         window_s=window_s,
         **kind,
-    )
+    ).model_dump(mode="json", exclude_unset=True)
 
 
 def asset_summary(examination: ExaminationState, findings: Iterable[str], reception: Reception = RECEPTION_OK) -> str:
@@ -221,16 +221,19 @@ def asset_snapshot(
 def asset_status(
     state: AssetState,
     definitions: Mapping[str, AlarmDefinition],
-    metadata: AssetMetadata,
+    metadata: Mapping[str, Any],
     reception: Reception = RECEPTION_OK,
     announced: Announcement | None = None,
     kept_s: float = 0.0,
-) -> AssetStatus:
-    """Return the status of an asset; `announced`: after which it learns again; `kept_s`: how long samples are kept."""
+) -> dict[str, Any]:
+    """Return the status of an asset as stored, an `AssetStatus`, whose values are checked where it is read.
+
+    `metadata`: as stored; `announced`: after which it learns again; `kept_s`: how long samples are kept.
+    """
     examination, findings = state.examination, quality.active_findings(state.quality)
     now = quality.limit_verdict(examination.verdict, findings)
     ne107 = evaluate_ne107(now, findings, [(definitions[name], alarm) for name, alarm in state.alarms.items()])
-    named, evaluation = examination.named, state.evaluation.status
+    named, outlook = examination.named, current_outlook(state.outlook, examination.faults)
     verdict = asset_verdict(examination, findings, reception, announced)
     summary = named if now == "fault" and named else asset_summary(examination, findings, reception)
     if verdict == "fault" and now != "fault":
@@ -242,42 +245,36 @@ def asset_status(
         learned_s = min(max(state.position.t - announced.since, 0.0), needed_s)
         learning = LearningStatus(**announced._asdict(), learned_s=learned_s, needed_s=needed_s)
         summary = learning.sentence(summary)
-    return AssetStatus.model_construct(  # its values are checked where it is read
-        **{
-            "verdict": verdict,
-            "summary": summary,
-            "since": examination.since,
-            "onset": examination.onset,
-            "faults": tuple(map(FaultEstimate.model_validate, examination.faults)),
-            "examined": examination.examined,
-            "ne107": ne107.ne107,
-            "reasons": ne107.reasons,
-            "quality": findings,
-            "alarms": {
-                name: AlarmStatus(
-                    state=alarm.state,
-                    since=alarm.since,
-                    priority=definitions[name].priority,
-                    # the cause at the last sample would be, once the fault has gone, that all is well
-                    cause=named if name == FAULT_ALARM and named else alarm.cause,
-                    until=alarm.shelved_until,
-                )
-                for name, alarm in state.alarms.items()
-                if alarm.state is not LifecycleState.NORMAL
-            },
-            "pending_diagnoses": tuple(window.number for window in state.pending_diagnoses),
-            "position": state.position,
-            "metadata": metadata,
-            **({} if examination.fault_at is None else {"fault_at": examination.fault_at}),
-            **({} if examination.diagnosed is None else {"diagnosed": examination.diagnosed}),
-            **(
-                {"size": FaultEstimate.model_validate(examination.size), "sized": examination.sized}
-                if examination.size
-                else {}
-            ),
-            **({} if (outlook := current_outlook(state.outlook, examination.faults)) is None else {"outlook": outlook}),
-            **({} if learning is None else {"learning": learning}),
-            **({} if reception == RECEPTION_OK else {"reception": reception.state}),
-            **{key: getattr(evaluation, key) for key in evaluation.model_fields_set},
-        }
-    )
+    return {
+        **state.evaluation.status.to_json(),
+        "verdict": verdict,
+        "summary": summary,
+        "since": examination.since,
+        "onset": examination.onset,
+        "examined": examination.examined,
+        **({"sized": examination.sized, "size": examination.size} if examination.size else {}),
+        "ne107": ne107.ne107,
+        "reasons": ne107.reasons,
+        **({} if learning is None else {"learning": learning.model_dump(mode="json")}),
+        "faults": examination.faults,
+        "quality": findings,
+        "alarms": {
+            name: {
+                "state": alarm.state.value,
+                "since": alarm.since,
+                "priority": definitions[name].priority,
+                # the cause at the last sample would be, once the fault has gone, that all is well
+                "cause": named if name == FAULT_ALARM and named else alarm.cause,
+                "until": alarm.shelved_until,
+            }
+            for name, alarm in state.alarms.items()
+            if alarm.state is not LifecycleState.NORMAL
+        },
+        "awaited": [window.number for window in state.pending_diagnoses],
+        **({} if reception == RECEPTION_OK else {"reception": reception.state}),
+        **({} if examination.fault_at is None else {"fault_at": examination.fault_at}),
+        **({} if examination.diagnosed is None else {"diagnosed": examination.diagnosed}),
+        **({} if outlook is None else {"outlook": outlook.model_dump(mode="json", exclude_unset=True)}),
+        "counted": vars(state.position),
+        "about": metadata,
+    }

@@ -24,6 +24,7 @@ import math
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib.util import find_spec
 from typing import Any
 
@@ -117,32 +118,42 @@ def _decode_binary(asset: str, message: bytes, received_at: float, covariates: S
     return _build_block(asset, stream, sequence, oldest if flags & FLAG_RETAINED else None, signals, received_at)
 
 
+@cache  # its memory is used again; while an error holds the document before, it refuses, and `_decode_json` reads
+def _parser() -> Any:
+    import simdjson
+
+    return simdjson.Parser()
+
+
 def _decode_regular(asset: str, message: bytes, received_at: float) -> Block | None:
     """Return what `_decode_json` returns, in a third of its time; None: not regular, which it knows more of.
 
     A message is regular if it has no covariates, each key once, and numbers alone in its lists.
     """
-    import simdjson
-
     try:
-        plain: Any = simdjson.Parser().parse(message)
-        whole = plain["version"], plain.get("stream", 0), plain["sequence"], plain.get("oldest", 0)
+        document = _parser().parse(message)
+        plain = {name: document[name] for name in document}  # to ask it for a key that it lacks takes long
+        counts = version, stream, sequence, oldest = (
+            plain["version"],
+            plain.get("stream", 0),
+            plain["sequence"],
+            plain.get("oldest", 0),
+        )
         columns = [plain[name] for name in ("truy" if "t" in plain else "ruy")]
         buffers = [column.as_buffer(of_type="d") for column in columns]
         signals = np.frombuffer(bytearray().join(buffers)).reshape(len(columns), -1)
-    except (AttributeError, KeyError, TypeError, ValueError, RuntimeError):
+    except (AttributeError, LookupError, TypeError, ValueError, RuntimeError):
         return None
-    keys, (version, stream, sequence, oldest) = set(plain), whole
     # a buffer makes one list of lists in lists; of a key that stands twice the last counts, not the first
-    are_flat = message.count(b"[") == len(columns) and {*map(len, columns)} == {signals.shape[1]}
-    if not (are_flat and len(keys) == len(plain) and keys <= REGULAR_KEYS):
-        return None
-    if version != VERSION or {*map(type, whole)} != {int}:
+    brackets = len(message) - len(message.replace(b"[", b""))  # in a sixth of the time of `message.count`
+    are_flat = brackets == len(columns) and {*map(len, columns)} == {signals.shape[1]}
+    are_known = len(plain) == len(document) and plain.keys() <= REGULAR_KEYS
+    if not (are_flat and are_known and version == VERSION and {*map(type, counts)} == {int}):
         return None
     if len(columns) == 3:
         t = _uniform_times(_parse_number(plain, "t0"), _parse_number(plain, "dt"), signals.shape[1])
         signals = np.concatenate([t[None], signals])
-    return _build_block(asset, stream, sequence, oldest if "oldest" in keys else None, signals, received_at)
+    return _build_block(asset, stream, sequence, oldest if "oldest" in plain else None, signals, received_at)
 
 
 def _decode_json(
@@ -241,7 +252,7 @@ def _build_block(
     if min(counts) < 0 or max(counts) > MAX_COUNT:
         name = next(name for name, n in zip(COUNTS, counts, strict=True) if not 0 <= n <= MAX_COUNT)
         raise MessageError("out of range", f"{name}: must lie between 0 and 2^63 - 1")
-    if not (np.minimum.reduce(t) >= 0.0 and np.maximum.reduce(t) < MAX_TIME_S):  # NaN is neither
+    if not (t.item(t.argmin()) >= 0.0 and t.item(t.argmax()) < MAX_TIME_S):  # NaN is both, and neither
         raise MessageError("times", "a time stamp is missing, or outside of the years 1970 to 9999")
     return Block.from_signals(asset, sequence, signals, received_at, stream, oldest)
 

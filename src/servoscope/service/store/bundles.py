@@ -10,6 +10,7 @@ import math
 import zlib
 from collections import defaultdict, deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -56,8 +57,9 @@ class BundleIndex:
     def __init__(self, rows: Iterable[tuple[int, int, str]]) -> None:
         self._number = 0  # of the newest row
         self._counts: dict[BundleKey, list[int]] = {}  # how many blocks of a row are needed, and how many there are
-        self._held: dict[str, deque[tuple[int, BundleKey]]] = {}  # of each asset, sequences and where they are
-        self._bundles: dict[str, int] = {}
+        self._bundle_number = cache(bundle_number)
+        # of each asset, sequences and where they are
+        self._held: defaultdict[str, deque[tuple[int, BundleKey]]] = defaultdict(deque)
         self._sparse: dict[BundleKey, int] = {}  # the newest row when at most half of a row was needed any more
         for bundle, number, contents in sorted(rows, key=lambda row: row[1]):
             self._hold((bundle, number), _read_contents(contents))
@@ -89,9 +91,7 @@ class BundleIndex:
         bundles: defaultdict[BundleKey, tuple[list[BundlePart], list[bytes]]] = defaultdict(lambda: ([], []))
         sizes, newest = defaultdict[int, int](int), self._number  # of each bundle, bytes so far
         for asset, sequence, stored, regular in wanted:
-            bundle = self._bundles.get(asset)
-            if bundle is None:
-                bundle = self._bundles[asset] = bundle_number(asset)
+            bundle = self._bundle_number(asset)
             sizes[bundle] += len(stored)
             parts, samples = bundles[bundle, newest + sizes[bundle] // ROW_BYTES]
             parts.append((asset, sequence, len(stored), regular))
@@ -106,10 +106,7 @@ class BundleIndex:
     def _hold(self, key: BundleKey, parts: Sequence[BundlePart]) -> None:
         self._counts[key] = [len(parts), len(parts)]
         for asset, sequence, *_ in parts:
-            held = self._held.get(asset)
-            if held is None:
-                held = self._held[asset] = deque()
-            held.append((sequence, key))
+            self._held[asset].append((sequence, key))
 
 
 def pack_samples(signals: FloatArray) -> list[tuple[bytes, bool]]:
