@@ -36,7 +36,7 @@ from servoscope.models.plants import Plant
 # in information from one size to the next: in between, a CUSUM is at most a fifth slower than the best
 INFORMATION_FACTOR = 4.0
 MAX_INFORMATION_RATE = 2000.0  # 1/s; a change with more information shows within a few samples anyway
-# information of one step of the test, with more of which a change is found at the next one anyway
+# information of one step of the test: a change with more has no CUSUM of its own, and is found one step later at most
 MAX_STEP_INFORMATION = 20.0
 OVERSHOOT = 1.166  # twice Siegmund's 0.583: by how much a random walk passes its limit, in its own steps
 MIN_INFORMATION_RATE = 0.05  # 1/s; with less, a change would take a quarter of an hour

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NoReturn
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.history import history_folder, read_history, replace_baseline
@@ -106,13 +105,12 @@ def relearn(
     learned = {baseline.point: baseline for baseline in earlier.per_point if baseline.point in new}
     together = {point: list(new[point]) for point in learned}
     for previous in () if after in RENEWALS else learned.values():
-        kept, missing = find_sources(previous, folders)
-        if missing and not leave_out:
-            _refuse_missing(path, missing[0], folders)
+        kept, missing = _earlier_recordings(path, previous, folders, leave_out)
         together[previous.point][:0] = kept
-        notes[previous.point] += [message("learning.source_missing", recording=name) for name in missing]
-    chosen = together.get("", together)
-    baseline = learn(loop, chosen, progress, accept_delay=accept_delay, force=force, earlier=earlier)
+        notes[previous.point] += missing
+    baseline = learn(
+        loop, together.get("", together), progress, accept_delay=accept_delay, force=force, earlier=earlier
+    )
     number = max(history) + 1
     changed = any(note.key == "learning.accepted" for some in notes.values() for note in some)
     revision = Revision(
@@ -134,11 +132,17 @@ def relearn(
     return baseline
 
 
-def _refuse_missing(path: Path, name: str, folders: Sequence[Path]) -> NoReturn:
-    raise BaselineError(
-        f"{path}: its recording {name} is not in {' or '.join(dict.fromkeys(map(str, folders)))}: put it there, or "
-        "learn from the new recordings alone (after a repair, for example)"
-    )
+def _earlier_recordings(
+    path: Path, baseline: Baseline, folders: Sequence[Path], leave_out: bool
+) -> tuple[list[Recording], list[Message]]:
+    """Return the recordings that a baseline was learned from, and notes on those that are not found and left out."""
+    recordings, missing = find_sources(baseline, folders)
+    if missing and not leave_out:
+        raise BaselineError(
+            f"{path}: its recording {missing[0]} is not in {' or '.join(dict.fromkeys(map(str, folders)))}: put it "
+            "there, or learn from the new recordings alone (after a repair, for example)"
+        )
+    return recordings, [message("learning.source_missing", recording=name) for name in missing]
 
 
 def find_sources(baseline: Baseline, folders: Sequence[Path]) -> tuple[list[Recording], list[str]]:

@@ -32,6 +32,7 @@ SILENT_NOISE_SHARE = 1e-6  # of the noise's variance at the start: what is quiet
 MAX_LOGARITHM = 6.0  # of a parameter relative to its start, and of the ratio of the noises
 DIFFERENCE, DELAY_DIFFERENCE = 1e-5, 1e-3  # of a logarithm, and of samples of delay, for derivatives
 LAGS = 20  # samples, up to which innovations are correlated with themselves
+MAX_AUTOCORRELATION = 0.1  # of innovations, up to which a plant is believed to be of the kind of the loop file
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,15 +117,11 @@ class PlantExperiment:
         start = self.factory.noise
         return WhiteNoise(u_std=start.u_std * math.exp(x[len(self.names)]), y_std=start.y_std)
 
-    def fitted_noise(self, fitted: Fit) -> WhiteNoise:
-        """Return the noise of a fit, at the level of its innovations."""
-        e, _ = self.standardised(fitted.x)
-        return self.noise(fitted.x).times(math.sqrt(float(e @ e) / len(e)))
-
-    def is_silent(self, fitted: Fit) -> bool:
-        """Return whether nothing is left: the recordings were simulated without noise."""
-        e, _ = self.standardised(fitted.x)
-        return float(e @ e) < SILENT_NOISE_SHARE * len(e)
+    def fitted_noise(self, fitted: Fit) -> WhiteNoise | None:
+        """Return the noise of a fit, at the level of its innovations; None without noise, or where nothing fits."""
+        e = self.standardised(fitted.x)[0] if np.isfinite(fitted.cost) else np.zeros(1)
+        level = float(e @ e) / len(e)
+        return None if level < SILENT_NOISE_SHARE else self.noise(fitted.x).times(math.sqrt(level))
 
     def innovations(self, x: FloatArray) -> FloatArray:
         """Return innovations whose sum of squares ranks as the likelihood does, shape (N,)."""

@@ -15,7 +15,13 @@ import numpy as np
 from servoscope.baseline.plant_fit import PRIOR_STD
 from servoscope.core.arrays import FloatArray
 from servoscope.estimation.noise_model import WhiteNoise, largest_autocorrelation
-from servoscope.fit.plant_experiment import LAGS, PlantExperiment, initial_noise, robust_covariance
+from servoscope.fit.plant_experiment import (
+    LAGS,
+    MAX_AUTOCORRELATION,
+    PlantExperiment,
+    initial_noise,
+    robust_covariance,
+)
 from servoscope.fit.search import fit
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
@@ -25,8 +31,6 @@ STARTS = (-2.0, 2.0)  # standard deviations of the prior, at which a search begi
 MIN_PARAMETER_PROBABILITY = 1e-3  # probability below which other parameters are not believed
 # and below which a file's own are not: four that stand in for twelve wrong ones lead to wrong names
 MIN_FILE_PROBABILITY = 0.05
-# autocorrelation of innovations up to which a plant is believed to be of the kind of the loop file
-MAX_AUTOCORRELATION = 0.1
 MAX_AUTOCORRELATION_STDS = 4.0  # standard deviations of an autocorrelation, from which innovations are not white
 
 
@@ -76,10 +80,10 @@ def _search(experiment: PlantExperiment, starts: Sequence[FloatArray] = ()) -> I
     m, free = len(experiment.names), experiment.all_but_delay
     ends = [fit(experiment.search, experiment.start(x), free) for x in (None, *starts)]
     best = min(ends, key=lambda end: end.cost)
-    if not np.isfinite(best.cost) or experiment.is_silent(best):
+    noise = experiment.fitted_noise(best)
+    if noise is None:
         return None
     largest = largest_autocorrelation(best.residual, LAGS)
     whiteness = largest * math.sqrt(len(best.residual))
     C = robust_covariance(best) if whiteness > MAX_AUTOCORRELATION_STDS else best.covariance
-    noise = experiment.fitted_noise(best)
     return InnovationFit(experiment.names, best.x[:m], C[:m, :m], noise, largest, whiteness)

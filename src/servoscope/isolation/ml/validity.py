@@ -31,8 +31,6 @@ def fit_exact_predictor(baseline: Baseline, recordings: Sequence[Recording]) -> 
         return None
     recorded = PlantExperiment.from_recordings(loop, recordings, baseline.plant, (), np.zeros(0), begin)
     likely = fit(recorded.search, recorded.start(), recorded.all_but_delay)
-    if not np.isfinite(likely.cost) or recorded.is_silent(likely):
-        return None
 
     def cost(x: FloatArray) -> float:
         return 0.5 * recorded.search.at(x.copy(), likely.free).cost
@@ -40,6 +38,8 @@ def fit_exact_predictor(baseline: Baseline, recordings: Sequence[Recording]) -> 
     # a minute hardly tells how loud n_u is: too much of it costs little, too little makes slow errors look certain
     loudest = raise_unknown(cost, likely.x, 0, MAX_LOUDER, BISECTIONS)
     noise = recorded.fitted_noise(recorded.search.at(loudest, likely.free))
+    if noise is None:
+        return None
     explained = baseline.model_copy(update={"exact": ExactPredictorFit(noise=noise, misfit=0.0)})
     windows = (RefitWindow.from_recording(explained, rec, 0, min(rec.samples, MAX_SAMPLES)) for rec in recordings)
     return ExactPredictorFit(noise=noise, misfit=max(_misfit(window) for window in windows))

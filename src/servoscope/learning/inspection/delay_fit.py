@@ -12,7 +12,13 @@ import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.estimation.noise_model import WhiteNoise, largest_autocorrelation
-from servoscope.fit.plant_experiment import LAGS, MAX_SAMPLES, PlantExperiment, robust_covariance
+from servoscope.fit.plant_experiment import (
+    LAGS,
+    MAX_AUTOCORRELATION,
+    MAX_SAMPLES,
+    PlantExperiment,
+    robust_covariance,
+)
 from servoscope.fit.search import MAX_STEPS, Fit, fit
 from servoscope.learning.inspection.delay import MAX_DELAY_S, MIN_MAX_DELAY_SAMPLES, PRIOR
 from servoscope.learning.inspection.model_order import Regressors, fit_regression
@@ -35,7 +41,6 @@ MAX_COST_GAP = 0.1  # of -2 log likelihood per sample, within which a second del
 COST_TOLERANCE = 1e-2  # of -2 log likelihood
 MIN_CERTAIN_LOG_RATIO = 16.0  # twice the logarithm of a likelihood ratio, and
 MIN_CERTAIN_STDS = 4.0  # standard deviations, above which a delay is certain
-MAX_WHITE_AUTOCORRELATION = 0.1  # largest autocorrelation of innovations that are called white
 
 
 @dataclass(frozen=True)
@@ -51,7 +56,7 @@ class DelayFit:
     @property
     def white(self) -> bool:
         """Whether plant, noise and delay leave nothing but noise."""
-        return self.largest_autocorrelation < MAX_WHITE_AUTOCORRELATION
+        return self.largest_autocorrelation < MAX_AUTOCORRELATION
 
     @property
     def significant(self) -> bool:
@@ -169,7 +174,7 @@ class DelaySearch:
         The innovations bend where the delay passes a whole sample, and a search may be stuck beside the bend.
         """
         end = self._fit(start, held=False)
-        if not np.isfinite(end.cost) or largest_autocorrelation(end.residual, LAGS) < MAX_WHITE_AUTOCORRELATION:
+        if not np.isfinite(end.cost) or largest_autocorrelation(end.residual, LAGS) < MAX_AUTOCORRELATION:
             return end
         whole = self._fit(np.append(end.x[:-1], round(end.x[-1])), held=True)
         return min(end, self._fit(whole.x, held=False), key=lambda fitted: fitted.cost)
