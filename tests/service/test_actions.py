@@ -120,7 +120,7 @@ def test_a_webhook_is_tried_until_it_is_taken_with_the_same_key_and_a_good_signa
             tries.append(deliver(row, settings, now))
             row = tries[-1].retry_entry
             now = row.due if row else now
-    assert [(one.attempt, one.delivered, one.retry_entry is None) for one in tries] == [
+    assert [(one.entry.attempts + 1, one.delivered, one.retry_entry is None) for one in tries] == [
         (1, False, False),
         (2, False, False),
         (3, True, True),
@@ -134,7 +134,7 @@ def test_a_webhook_is_tried_until_it_is_taken_with_the_same_key_and_a_good_signa
         stamps.append(headers["X-Servoscope-Timestamp"])
         expected = hmac.new(b"hush", stamps[-1].encode() + b"." + body, hashlib.sha256).hexdigest()
         assert headers["X-Servoscope-Signature"] == f"sha256={expected}"
-        assert headers["Idempotency-Key"] == json.loads(body)["key"] == tries[0].key
+        assert headers["Idempotency-Key"] == json.loads(body)["key"] == tries[0].entry.key
         assert headers["Content-Type"] == "application/json"
     assert all(abs(int(stamp) - time.time()) < 60.0 for stamp in stamps)  # by the clock that receivers compare with
     event = json.loads(receiver.requests[0][1])

@@ -41,7 +41,7 @@ def test_a_slow_sink_delays_no_other(tmp_path: Path) -> None:
         time.sleep(0.05)
         heard = dispatcher.take_attempts()
     dispatcher.stop()
-    assert [(one.sink, one.delivered) for one in heard] == [("quick", True)]
+    assert [(one.entry.sink, one.delivered) for one in heard] == [("quick", True)]
     store.close()
 
 

@@ -210,10 +210,10 @@ def test_more_than_an_hour_takes_waits_and_comes_as_one_mail(
     def store_attempts(number: list[int] = [1]) -> int:  # noqa: B006
         for one in dispatcher.take_attempts():
             assert one.delivered, one.detail
-            attempts.append(one.key)
+            attempts.append(one.entry.key)
             number[0] += 1
             done = Batch()
-            done.deliveries[one.key] = {"attempts": 1, "due": None, "outcome": one.detail}
+            done.deliveries[one.entry.key] = {"attempts": 1, "due": None, "outcome": one.detail}
             store.write(done, "hall", number[0])
         return len(attempts)
 

@@ -128,7 +128,6 @@ def diagnose_logs(
     from servoscope.cli.render import diagnosis, results
     from servoscope.diagnosis.arm import examine_arm
     from servoscope.report import document, plain_values
-    from servoscope.report.arm_page import write_arm_page
     from servoscope.signals.readers.arm_log import read_arm_log
 
     pages = OutputPaths.from_option(report, ".html", len(logs) > 1, logs)
@@ -145,6 +144,8 @@ def diagnose_logs(
                     results.create_console(), result, document.DETAILS if details else document.EVIDENCE
                 )
             if pages is not None:
+                from servoscope.report.arm_page import write_arm_page  # late: it draws
+
                 pages.write(path, recording.name, write_arm_page, result, examination, baseline, stderr=as_json)
     if fail_on_fault and faulty:
         raise typer.Exit(EXIT_FAULT)

@@ -68,16 +68,11 @@ class StreamState:
         return cls(numbers["by"], numbers["until_us"], blocks, numbers["day"], numbers["error"], state)
 
     @property
-    def pending_us(self) -> int | None:
-        """The first row that waits for the watermark, or a time before it [us]; None: none does."""
-        done = self.processed_until_us
-        return min((max(low, done + 1) for low, high in self.blocks.values() if high > done), default=None)
-
-    @property
     def due_us(self) -> int | None:
         """The time that the watermark has to pass before there is something to do [us]; None: nothing is."""
-        times = [self.pending_us, None if self.day is None else (self.day + 1) * DAY_US]
-        return min((time for time in times if time is not None), default=None)
+        done, over = self.processed_until_us, [] if self.day is None else [(self.day + 1) * DAY_US]
+        waiting = (max(low, done + 1) for low, high in self.blocks.values() if high > done)  # rows, from there at most
+        return min((*waiting, *over), default=None)
 
 
 class StreamShard:

@@ -6,7 +6,9 @@ import base64
 import io
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from matplotlib.figure import Figure
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.messages import say, translate
@@ -15,18 +17,17 @@ from servoscope.diagnosis.diagnose import diagnose_with_trace
 from servoscope.diagnosis.motion_signature import MotionSignature, SignatureWidth, compare_signatures
 from servoscope.diagnosis.result import Diagnosis
 from servoscope.models.loop import Loop
+from servoscope.report import diagnosis_figures as figures
 from servoscope.report.diagnosis_document import LABELS, DiagnosisContext, diagnosis_document
 from servoscope.report.document import DETAILS, HEADLINE, Section, to_html
 from servoscope.report.format_values import DASH, format_clock_time, format_count, format_quantity, format_with_std
 from servoscope.report.page import ResultTable, render_page, write_page
 from servoscope.report.plain_values import provenance
 from servoscope.report.plots import plot
+from servoscope.report.plotting import render_svg
 from servoscope.signals import Recording
 from servoscope.signals.readers import as_recording
 from servoscope.signals.readers.frames import Source
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 CELL_DPI = 60  # of the picture in a notebook
 
@@ -77,8 +78,6 @@ def render_diagnosis_page(
     diagnosis: Diagnosis, trace: Trace, recording: Recording, loop: Loop, provenance: Mapping[str, str]
 ) -> str:
     """Return the page that `write_diagnosis_page` writes; it needs nothing from outside, no script and no network."""
-    from servoscope.report.plotting import render_svg  # late: matplotlib takes half a second to import
-
     signatures = compare_signatures(recording, loop, diagnosis.onset_s[1] if diagnosis.onset_s else None)
     context = DiagnosisContext(
         words={fault.name: fault.words for fault in loop.plant.all_faults},
@@ -134,8 +133,6 @@ def _figures(
     signatures: tuple[MotionSignature | None, MotionSignature | None],
 ) -> Iterator[tuple[str, Figure]]:
     """Yield the pictures of the document by name."""
-    from servoscope.report import diagnosis_figures as figures
-
     yield "statistic", figures.plot_statistic(trace, diagnosis)
     yield "signals", figures.plot_signals(recording, diagnosis, units=loop.plant.units)
     yield "ifrf", figures.plot_ifrf(trace, diagnosis)

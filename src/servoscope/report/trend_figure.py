@@ -10,14 +10,12 @@ from matplotlib.figure import Figure
 
 from servoscope.prognosis.forecast import DAY_S, Prognosis
 from servoscope.prognosis.series import NORMAL_95, SizeSeries
-from servoscope.report.plotting import COLOURS, plot_style, save_figure
+from servoscope.report.plotting import COLOURS, create_panels, plot_style, save_figure
 
 
 def draw_trend(series: SizeSeries, trend: Prognosis) -> Figure:
     """Return the picture: values with their 95 % intervals, limit, and the interval of the time until it."""
-    figure = Figure(figsize=(7.2, 3.2), layout="constrained")
-    axes = figure.add_subplot()
-
+    figure, axes = create_panels(3.2, width=7.2)
     days = series.t / DAY_S  # matplotlib counts days since 1970
     axes.errorbar(
         days,

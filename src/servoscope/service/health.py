@@ -7,15 +7,13 @@ import socket
 import sys
 import threading
 import time
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from servoscope.core.errors import ConfigError
-from servoscope.service.assets.status import AssetStatus
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
@@ -61,21 +59,6 @@ class HealthReport:
 
 def _json_answer(ok: bool, headers: Mapping[str, object]) -> HealthAnswer:
     return HealthAnswer(200 if ok else 503, json.dumps({"ok": ok, **headers}).encode(), "application/json")
-
-
-def status_gauges(statuses: Iterable[tuple[str, AssetStatus]]) -> Iterator[Metric]:
-    """Yield the verdicts of assets, by name, and how many alarms are not normal."""
-    from prometheus_client.core import GaugeMetricFamily
-
-    verdicts = GaugeMetricFamily("servoscope_verdict", "1 for the verdict that holds", labels=["asset", "verdict"])
-    count: Counter[tuple[str, str, str]] = Counter()
-    for name, status in statuses:
-        verdicts.add_metric([name, status.verdict], 1.0)
-        count.update(
-            (alarm, alarm_status.priority or "", alarm_status.state.value)
-            for alarm, alarm_status in status.alarms.items()
-        )
-    yield from (verdicts, alarm_gauge(count))
 
 
 def alarm_gauge(count: Mapping[tuple[str, str, str], int]) -> Metric:

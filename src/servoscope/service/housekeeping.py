@@ -68,16 +68,11 @@ class Housekeeping:
 
     def _store_deliveries(self) -> None:
         for attempt in self._service.dispatcher.take_attempts():
-            log(
-                "info" if attempt.delivered else "warning",
-                "delivery",
-                key=attempt.key,
-                sink=attempt.sink,
-                outcome=attempt.detail,
-            )
+            level, entry = "info" if attempt.delivered else "warning", attempt.entry
+            log(level, "delivery", key=entry.key, sink=entry.sink, outcome=attempt.detail)
             due = None if attempt.retry_entry is None else attempt.retry_entry.due
-            row = {"attempts": attempt.attempt, "due": due, "outcome": attempt.detail}
-            self._service.writer.batch.deliveries[attempt.key] = row
+            row = {"attempts": entry.attempts + 1, "due": due, "outcome": attempt.detail}
+            self._service.writer.batch.deliveries[entry.key] = row
 
     def _store_rejections(self) -> None:
         """Store what came from outside and could not be used: at once, then once a minute, for each of its kinds."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections import Counter as TotalCounter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -74,9 +74,8 @@ class ServiceMetrics:
         from prometheus_client import generate_latest
 
         start = time.thread_time()
-        series = write_asset_series(self._service.assets)
-        self._alarms = series.alarms
-        text = generate_latest(self.registry) + series.text.encode()
+        series, self._alarms = write_asset_series(self._service.assets)
+        text = generate_latest(self.registry) + series.encode()
         self._render_s += time.thread_time() - start
         return text
 
@@ -127,15 +126,11 @@ class ServiceMetrics:
             yield GaugeMetricFamily(f"servoscope_{name}", words, value=float(value))
 
 
-class AssetSeries(NamedTuple):
-    """The series of all assets, and how many alarms of each name, priority and state are not normal."""
+def write_asset_series(assets: Mapping[str, Asset]) -> tuple[str, TotalCounter[tuple[str, str, str]]]:
+    """Return the metrics of assets as text, and how many alarms of each name, priority and state are not normal.
 
-    text: str
-    alarms: TotalCounter[tuple[str, str, str]]
-
-
-def write_asset_series(assets: Mapping[str, Asset]) -> AssetSeries:
-    """Write down the metrics of assets, from any thread; those that have not begun have only a reception."""
+    From any thread; assets that have not begun have only a reception.
+    """
     counts: dict[str, list[str]] = {key: [] for key in STREAM_COUNTERS}
     last, verdicts, receptions, alarms = list[str](), list[str](), list[str](), TotalCounter[tuple[str, str, str]]()
     for name, asset in assets.items():
@@ -162,7 +157,7 @@ def write_asset_series(assets: Mapping[str, Asset]) -> AssetSeries:
     for name, kind, words, lines in families:
         heads = f"# HELP servoscope_{name} {words}", f"# TYPE servoscope_{name} {kind}"
         text += "\n".join([*heads, *lines, ""])
-    return AssetSeries(text, alarms)
+    return text, alarms
 
 
 def escape_label(value: str) -> str:

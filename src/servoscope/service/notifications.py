@@ -136,7 +136,8 @@ class Notifier:
         alarm = alarms.get(FAULT_ALARM)
         if alarm is None or alarm.state in QUIET_STATES:
             return []
-        if any(held_alarm.key == (alarm.asset, FAULT_ALARM) for held_alarm in self._flood.held):
+        held = ((held_alarm.transition.asset, held_alarm.transition.alarm) for held_alarm in self._flood.held)
+        if (alarm.asset, FAULT_ALARM) in held:
             return []
         outcome = {"verdict": diagnosis.verdict, "diagnosis": diagnosis.summary, "onset": diagnosis.onset}
         details = {**self._advice(FAULT_ALARM), **outcome, "faults": diagnosis.document.get("faults", [])}

@@ -5,12 +5,12 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
 from http.client import HTTPConnection, HTTPException
 from json import loads
 from pathlib import Path
+from typing import Any
 
 from servoscope.core.errors import ServoscopeError
 from servoscope.core.messages import count_words
@@ -104,46 +104,42 @@ class _Follower:
             raise OSError(f"no answer: {error}") from None
 
 
-@dataclass
 class WorkerPool:
     """A service whose assets are shared out among processes; each follows those of its shard as a service of its own.
 
     `config`: the whole service file, from `path`; `restarted`: assets that begin with a new state.
     """
 
-    config: ServiceFile
-    path: Path
-    restarted: Collection[str] = ()
-    _workers: list[_Follower] = field(default_factory=list)
-    _stopping: threading.Event = field(default_factory=threading.Event)
-    _reload: threading.Event = field(default_factory=threading.Event)
-    last_turn: float = field(default_factory=time.monotonic)
+    def __init__(self, config: ServiceFile, path: Path, restarted: Collection[str] = ()) -> None:
+        names = [config.shard_name(number) for number in sorted(config.shard_numbers())]
+        check_restarted(restarted, [*config.assets, *names])
+        check_service_file(config)
+        self.config, self.path, self.restarted = config, path, restarted
+        self._workers, self.last_turn = list[_Follower](), time.monotonic()
+        self._stopping, self._reload = threading.Event(), threading.Event()
 
     def health_report(self) -> HealthReport:
         """Return what it reports of itself over HTTP."""
         return HealthReport(
-            lambda: merge_metrics(answer.decode() for answer in self._ask_all("/metrics")).encode(),
+            lambda: merge_metrics(text for _, text in self._ask_all("/metrics", bytes.decode) if text).encode(),
             lambda: self.unready_reason,
             lambda: self.degraded_reason,
             lambda: self.last_turn,
         )
 
-    def _ask_all(self, path: str) -> list[bytes]:
-        answers = []
+    def _ask_all(self, path: str, parse: Callable[[bytes], Any]) -> Iterator[tuple[_Follower, Any]]:
+        """Yield each worker with its answer, None where it has none: its supervisor starts it again."""
         for worker in self._workers:
             try:
-                answers.append(worker.ask(path))
-            except OSError:
-                continue  # its supervisor starts it again; readiness says so
-        return answers
+                yield worker, parse(worker.ask(path))
+            except (OSError, ValueError):
+                yield worker, None
 
     def _why(self, key: str) -> str:
         whys = []
-        for worker in self._workers:
-            try:
-                why = str(loads(worker.ask("/health/ready"))[key])
-            except (OSError, ValueError):
-                why = "does not answer" if key == "why" and not worker.supervisor.done else ""
+        for worker, answer in self._ask_all("/health/ready", loads):
+            is_silent = answer is None and key == "why" and not worker.supervisor.done
+            why = "does not answer" if is_silent else "" if answer is None else answer[key]
             whys += [f"worker {worker.number}: {why}"] if why else []
         return "; ".join(whys)
 
@@ -165,11 +161,6 @@ class WorkerPool:
         """Let all workers change to what the service file says now, soon; for a signal's handler."""
         self.path = path
         self._reload.set()
-
-    def __post_init__(self) -> None:
-        names = [self.config.shard_name(number) for number in sorted(self.config.shard_numbers())]
-        check_restarted(self.restarted, [*self.config.assets, *names])
-        check_service_file(self.config)
 
     def run(self, announce: Callable[[], None] = lambda: None) -> None:
         """Run until it is stopped, or all workers have nothing left to do; `announce` is called when all have begun."""
@@ -222,13 +213,10 @@ class WorkerPool:
 
     def _end_hung(self) -> None:
         """Kill workers that answer, and do nothing else: they are started again."""
-        for worker in self._workers:
-            try:
-                if not loads(worker.ask("/health/live"))["ok"]:
-                    log("error", "worker hangs", worker=worker.number)
-                    worker.supervisor.send_signal(signal.SIGKILL)
-            except (OSError, ValueError):
-                continue
+        for worker, answer in self._ask_all("/health/live", loads):
+            if answer is not None and not answer["ok"]:
+                log("error", "worker hangs", worker=worker.number)
+                worker.supervisor.send_signal(signal.SIGKILL)
 
     def _change(self, files: Sequence[int]) -> None:
         """Change to what the service file says now; where that cannot be used, go on as before."""

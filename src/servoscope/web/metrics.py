@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter as TotalCounter
 from collections.abc import Iterator, Mapping
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from starlette.types import Scope
 
-from servoscope.service.health import status_gauges
+from servoscope.service.health import alarm_gauge
 from servoscope.web.event_hub import EventHub
 from servoscope.web.statuses import asset_statuses
 
@@ -52,9 +53,11 @@ class WebMetrics:
         yield cut
         up = float(not self._hub.error)
         yield GaugeMetricFamily("servoscope_store_up", "Whether the store answered at the last look", value=up)
-        assets = list(asset_statuses(list(self._hub.statuses.values())))
-        yield from status_gauges((stored.name, status) for stored, status in assets)
-        family = GaugeMetricFamily("servoscope_stored_time_seconds", "When an asset was last stored", labels=["asset"])
-        for stored, _ in assets:
-            family.add_metric([stored.name], stored.at)
-        yield family
+        verdicts = GaugeMetricFamily("servoscope_verdict", "1 for the verdict that holds", labels=["asset", "verdict"])
+        times = GaugeMetricFamily("servoscope_stored_time_seconds", "When an asset was last stored", labels=["asset"])
+        count: TotalCounter[tuple[str, str, str]] = TotalCounter()
+        for stored, status in asset_statuses(list(self._hub.statuses.values())):
+            verdicts.add_metric([stored.name, status.verdict], 1.0)
+            times.add_metric([stored.name], stored.at)
+            count.update((name, alarm.priority or "", alarm.state.value) for name, alarm in status.alarms.items())
+        yield from (verdicts, alarm_gauge(count), times)

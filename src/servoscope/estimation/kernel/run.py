@@ -157,15 +157,10 @@ class LaneBlock:
 
     # states and samples between the arrays of a fleet and the lanes
 
-    def unpack(self, state: str, places: Sequence[Int]) -> None:
-        """Write how states, which begin at some places, are copied to the lanes."""
+    def copy_states(self, state: str, places: Sequence[Int], *, out: bool) -> None:
+        """Write how states, which begin at some places, are copied to the lanes, or the lanes to them."""
         for memory, begin, count in self._parts:
-            self.copy(memory, count, [place + begin for place in places], state, "double", out=False)
-
-    def pack(self, state: str, places: Sequence[Int]) -> None:
-        """Write how the lanes are copied to states."""
-        for memory, begin, count in self._parts:
-            self.copy(memory, count, [place + begin for place in places], state, "double", out=True)
+            self.copy(memory, count, [place + begin for place in places], state, "double", out=out)
 
     def fetch(self, signals: Sequence[str], places: Sequence[Int], samples: Int) -> None:
         """Write how samples from some places on are copied to the tile, as many as it holds."""
@@ -262,7 +257,7 @@ def run_blocks(p: LlvmPrinter, spec: KernelSpec, lanes: int, element: str, own: 
         c = Memory(p, place, element, lanes, shared=lanes > 1 and not own)
         row = [minimum(b * lanes + lane, assets - 1) for lane in range(lanes)]  # the last one fills what is left
         states = [asset * (floats + private) for asset in row]
-        block.unpack("%state", states)
+        block.copy_states("%state", states, out=False)
         block.clear_restarts()
         for i in p.loop(0, private):
             at = states[0] + floats + i
@@ -292,7 +287,7 @@ def run_blocks(p: LlvmPrinter, spec: KernelSpec, lanes: int, element: str, own: 
                 places = [asset * whole["out_step"] + column.value for asset in row]
                 block.copy(q, size.row, places, "%out", element, out=True)
                 column.value = column.value + size.row
-        block.pack("%new", states)
+        block.copy_states("%new", states, out=True)
 
 
 def run_sample(p: LlvmPrinter, spec: KernelSpec, lanes: int, element: str, own: bool) -> None:
@@ -304,14 +299,14 @@ def run_sample(p: LlvmPrinter, spec: KernelSpec, lanes: int, element: str, own: 
         return p.truncate(Float(p, memory.load(row), memory.kind))
 
     every, stride, number = whole(c, 0), whole(c, 1), whole(state, SAMPLE)
-    block.unpack("%state", [zero])
+    block.copy_states("%state", [zero], out=False)
     for k, name in enumerate(("%r", "%u", "%y", p.constant(0.0, "double"))):
         block.tile.store(k * TILE, name)
     block.phase.value = number % stride
     last = ((number + 1) % every).is_equal(0)
     extra = state.behind(HEADER_SIZE + size.floats + size.watched)
     block.process(c, 0, 1, stride, (number % every).is_equal(0), last, extra)
-    block.pack("%state", [zero])
+    block.copy_states("%state", [zero], out=True)
     p.write(f"ret i1 {last.text}")
 
 
@@ -320,7 +315,7 @@ def evaluate_states(p: LlvmPrinter, spec: KernelSpec, lanes: int, element: str, 
     block, size = LaneBlock(p, spec, 1, element), spec.sizes
     for asset in p.loop(0, p.argument("assets")):
         c = Memory(p, p.place(element, "%constants", asset * p.argument("constant_step")), element)
-        block.unpack("%state", [asset * (HEADER_SIZE + size.floats + size.watched + size.extra)])
+        block.copy_states("%state", [asset * (HEADER_SIZE + size.floats + size.watched + size.extra)], out=False)
         block.evaluate(c, Memory(p, p.place(element, "%out", asset * size.row), element))
 
 
@@ -331,7 +326,7 @@ def write_regressors(p: LlvmPrinter, spec: KernelSpec, lanes: int, element: str,
     """
     block, size, zero = LaneBlock(p, spec, 1, element), spec.sizes, Int(p, "0")
     c, samples, stride = Memory(p, "%constants", element), p.argument("samples"), p.argument("stride")
-    block.unpack("%state", [zero])
+    block.copy_states("%state", [zero], out=False)
     number = p.truncate(Float(p, block.h.load(SAMPLE), "double"))
     for k in p.loop(0, samples):
         for row, name in enumerate(("%r", "%u", "%y")):
@@ -345,7 +340,7 @@ def write_regressors(p: LlvmPrinter, spec: KernelSpec, lanes: int, element: str,
         with p.when(status > MISSING):
             for i in range(size.rows):
                 p.store(element, block.v.load(i), p.place(element, "%out", k * size.rows + i))
-    block.pack("%state", [zero])
+    block.copy_states("%state", [zero], out=True)
 
 
 FUNCTIONS = {

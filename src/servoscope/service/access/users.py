@@ -6,14 +6,10 @@ import json
 import os
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 from servoscope.core.errors import AccessError
 from servoscope.core.files import atomic_write
-
-if TYPE_CHECKING:
-    from argon2 import PasswordHasher
-
 
 Role = Literal["viewer", "operator", "engineer"]
 ROLES: tuple[Role, ...] = get_args(Role)  # each may do what those before it may
@@ -32,7 +28,11 @@ class Users:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._hasher = create_hasher()
+        try:
+            from argon2 import PasswordHasher
+        except ModuleNotFoundError:
+            raise AccessError("argon2-cffi is missing, pip install 'servoscope[web]'") from None
+        self._hasher = PasswordHasher()  # with the parameters of RFC 9106's second choice
         # compared with the password of an unknown user, so that the time of the answer does not show which users exist
         self._dummy_hash = self._hasher.hash(os.urandom(16).hex())
         self._file_stamp: tuple[int, int] | None = None
@@ -116,15 +116,3 @@ class Users:
         """Return what changes with a user's password: that ends the sessions that began before."""
         self.all()
         return str(self._users[name]["password"])[-16:] if name in self._users else None
-
-
-def create_hasher() -> PasswordHasher:
-    """Return what turns passwords into digests, with the parameters of RFC 9106's second choice.
-
-    Raises AccessError if the library is missing.
-    """
-    try:
-        from argon2 import PasswordHasher
-    except ModuleNotFoundError:
-        raise AccessError("argon2-cffi is missing, pip install 'servoscope[web]'") from None
-    return PasswordHasher()

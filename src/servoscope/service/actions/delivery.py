@@ -69,10 +69,7 @@ def deliver_together(
         outcome, failure = _shorten(hide_secrets(str(error))), error
     return [
         DeliveryAttempt(
-            row.key,
-            row.sink,
-            now,
-            row.attempts + 1,
+            row,
             failure is None,
             outcome,
             None

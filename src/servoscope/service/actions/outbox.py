@@ -44,10 +44,7 @@ class OutboxEntry:
 class DeliveryAttempt:
     """How one attempt went."""
 
-    key: str
-    sink: str
-    time: float  # (epoch, s)
-    attempt: int  # which one, from 1
+    entry: OutboxEntry  # as it was before
     delivered: bool  # whether the receiver has accepted it
     detail: str  # the answer, in one line
     retry_entry: OutboxEntry | None = None  # replaces the entry in the outbox; None: it is delivered or given up

@@ -17,11 +17,6 @@ class HeldAlarm:
     priority: Priority
     count: int
 
-    @property
-    def key(self) -> tuple[str, str]:
-        """Asset and alarm."""
-        return self.transition.asset, self.transition.alarm
-
 
 @dataclass(frozen=True)
 class FloodState(PersistentState):
@@ -62,7 +57,6 @@ def notify_transition(
         if state.since is None and len(recent) > settings.limit:
             state = replace(state, since=transition.time)
             notices += (Notification("flood_begins", transition.time, counted=counted, peak=state.peak),)
-    # each transition looks through all that is held, thousands in a flood: not by `key`, which takes ten times as long
     asset, alarm = transition.asset, transition.alarm
     places = [
         k

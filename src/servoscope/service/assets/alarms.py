@@ -22,7 +22,7 @@ from servoscope.service.alarms import (
 )
 from servoscope.service.assets.checkpoint import AssetState, evolve
 from servoscope.service.assets.examination_schedule import ExaminationState
-from servoscope.service.assets.outlook import OutlookWord, outlook_word
+from servoscope.service.assets.outlook import OutlookWord, current_outlook
 from servoscope.service.assets.reception import Reception
 from servoscope.service.assets.status import Announcement, asset_snapshot
 from servoscope.signals import quality
@@ -103,6 +103,7 @@ class AssetAlarms:
         return settled.at if state.alarms_at is None else state.alarms_at, settled.until
 
     def _known(self, state: AssetState, reception: Reception, t: float) -> _AlarmInputs:
-        word = outlook_word(state.outlook, state.examination.faults, t, self._ahead_s)
+        outlook = current_outlook(state.outlook, state.examination.faults)  # of one that has gone nothing is left
+        word = "far" if outlook is None else outlook.word(t, self._ahead_s)
         findings = tuple(quality.active_findings(state.quality))
         return _AlarmInputs(state.examination, findings, reception, word, self.announced)

@@ -45,7 +45,7 @@ from servoscope.service.assets.records import (
     check_continuity,
     transition_row,
 )
-from servoscope.service.assets.states import AssetStates, RestPeriod, StateHolder
+from servoscope.service.assets.states import AssetStates, StateHolder
 from servoscope.service.assets.status import Announcement, asset_metadata, asset_status
 from servoscope.service.clock import LayerTimes
 from servoscope.service.config import DiagnosisSettings
@@ -102,8 +102,7 @@ class Asset(StateHolder):
         since, until = rest_period(state.examination)
         from_s, to_s = self.alarms.standstill(state, self.reception)
         undisturbed = self.reception == RECEPTION_OK and not self._ticked
-        period = RestPeriod(state.examination.verdict == "fault", max(since, from_s), min(until, to_s))
-        self._row = states.put(row, state, period if undisturbed else period._replace(until=-math.inf))
+        self._row = states.put(row, state, max(since, from_s), min(until, to_s) if undisturbed else -math.inf)
 
     @property
     def reception(self) -> Reception:

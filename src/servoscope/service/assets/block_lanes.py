@@ -107,7 +107,7 @@ class BlockLanes:
 
     def __init__(self, rate: float, limits: quality.QualityLimits, residual_every_s: float) -> None:
         self._rate, self._limits, self._residual_every_s = rate, limits, residual_every_s
-        self._timebase = Timebase(1.0 / rate)
+        self.timebase = Timebase(1.0 / rate)
 
     def follow(
         self, monitor: AnyMonitor, state: AssetState, block: FloatArray, restart: bool, layers: LayerTimes
@@ -117,7 +117,7 @@ class BlockLanes:
         `block`: t, r, u, y and covariates, shape (4 + k, N); `restart`: whether samples before it are missing.
         """
         last = np.nan if state.last_t is None else state.last_t
-        order = self._timebase.order_block(block[0], last)
+        order = self.timebase.order_block(block[0], last)
         order.restart[:1] |= restart
         t, signals = block[0, order.rows], block[1:, order.rows]
         r, u, y, *covariates = np.where(np.isfinite(signals), signals, np.nan)
@@ -131,16 +131,11 @@ class BlockLanes:
         evaluations = self._evaluate(trace, t[None], state.samples)
         return LanesOutput(new, checked[None], np.array([order.t]), len(t), evaluations).lane(0, state)
 
-    def are_regular(self, t: FloatArray, last: FloatArray) -> BoolArray:
-        """Tell which of some blocks, with times `t` (blocks, N), need no sorting, nor a second look at what was `last`.
-
-        `last`: time of the last sample before each, shape (blocks,), NaN: there was none [UTC s].
-        """
-        return self._timebase.is_regular(t, last)
-
     def begin_regularly(self, t: FloatArray) -> BoolArray:
         """Tell which of some first blocks, with times `t` (blocks, N), need no sorting."""
-        return self.are_regular(t, t[:, 0] - self._timebase.period) & (np.abs(t[:, [0, -1]]) < MAX_TIME_S).all(axis=1)
+        return self.timebase.is_regular(t, t[:, 0] - self.timebase.period) & (np.abs(t[:, [0, -1]]) < MAX_TIME_S).all(
+            axis=1
+        )
 
     def follow_lanes(
         self,

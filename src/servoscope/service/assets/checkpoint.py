@@ -96,6 +96,7 @@ def pack_state(state: AssetState) -> bytes:
     """Return a state as bytes, with version and digest."""
     import msgspec
 
+    at = {} if state.alarms_at is None else {"at": state.alarms_at}
     document = {
         "asset": state.asset,
         "baseline": state.baseline,
@@ -105,7 +106,7 @@ def pack_state(state: AssetState) -> bytes:
         "fed": state.samples,
         "thinned": vars(state.history),
         "windows": [vars(window) for window in state.pending_diagnoses],
-        "alarms": {name: {"version": alarm.VERSION, **vars(alarm)} for name, alarm in state.alarms_now.items()},
+        "alarms": {name: {"version": alarm.VERSION, **vars(alarm), **at} for name, alarm in state.alarms.items()},
         "shown": state.evaluation.status.to_json(),
         **({} if state.outlook is None else {"outlook": state.outlook.model_dump(mode="json")}),
     }

@@ -143,7 +143,7 @@ class AssetGroups:
                 is_new[i] = True
             place.asset.move_state(states, place.row)
         follows = states.are_next(rows, [block.sequence for _, block in placed], [block.stream for _, block in placed])
-        follows &= lanes.are_regular(t, states.columns["last_t"][rows]) & ~(t[:, -1] > latest)
+        follows &= lanes.timebase.is_regular(t, states.columns["last_t"][rows]) & ~(t[:, -1] > latest)
         follows = (follows & states.columns["is_here"][rows]) | is_new
         monitors = states.monitor[rows]
         phases = fleet.monitor.phase(monitors)

@@ -91,14 +91,6 @@ def current_outlook(outlook: Outlook | None, faults: Sequence[Mapping[str, Any]]
     return outlook if outlook is not None and outlook.name == single_fault(faults) else None
 
 
-def outlook_word(
-    outlook: Outlook | None, faults: Sequence[Mapping[str, Any]], now: float, ahead_s: float
-) -> OutlookWord:
-    """Return how near the limit of the fault that there is now is: of one that has gone nothing is left to wait for."""
-    current = current_outlook(outlook, faults)
-    return "far" if current is None else current.word(now, ahead_s)
-
-
 def prognose_in_worker(
     _: Callable[[str], None], name: str, columns: Mapping[str, Sequence[float]], limit: float
 ) -> dict[str, Any]:

@@ -57,14 +57,6 @@ POSITION = ["t", "sequence", "blocks", "counted", "digest", "rows"]
 POSITION_FIELDS = ["samples" if name == "counted" else name for name in POSITION]
 
 
-class RestPeriod(NamedTuple):
-    """From when and until when [UTC s] an asset is at rest while the recursion says that there is a fault, or none."""
-
-    is_fault: bool
-    since: float
-    until: float
-
-
 class StateRow(NamedTuple):
     """Where the state of an asset is."""
 
@@ -83,8 +75,11 @@ class AssetStates:
         # the newest evaluations of each asset, since its state is here; its column `lane` says which of them
         self._evaluations = np.full(assets, None, dtype=object)
 
-    def put(self, row: int, state: AssetState, period: RestPeriod) -> StateRow:
-        """Write a state into a row."""
+    def put(self, row: int, state: AssetState, since: float, until: float) -> StateRow:
+        """Write a state into a row.
+
+        `since`, `until`: the asset is at rest between them while the recursion agrees with the verdict [UTC s].
+        """
         position, history, evaluation = state.position, state.history, state.evaluation
         self.columns[row] = (
             True,
@@ -92,7 +87,7 @@ class AssetStates:
             position.rows,
             *(state.samples, _number(state.last_t), _number(evaluation.t), evaluation.exceeded),
             *(_number(history.period), history.excess, history.level, _number(state.alarms_at)),
-            *(0, *period),
+            *(0, state.examination.verdict == "fault", since, until),
         )
         self.monitor[row], self.quality[row], self._evaluations[row] = state.monitor, state.quality, None
         return StateRow(self, row)

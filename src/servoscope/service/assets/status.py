@@ -1,6 +1,6 @@
 """What users see of an asset and of the service: the status that is stored beside each checkpoint.
 
-`model_validate` reads a stored status, of any version; `asset_status` and `to_json` return what is stored.
+`model_validate` reads a stored status, of any version; `asset_status` returns what is stored of an asset.
 """
 
 from __future__ import annotations
@@ -141,10 +141,6 @@ class ServiceStatus(_StatusRecord):
     service: Literal[True] = True
     flood: FloodCounts
     alarms: dict[str, AlarmStatus]
-
-    def to_json(self) -> dict[str, Any]:
-        """Return it as stored."""
-        return {"service": True, **self.model_dump(mode="json", exclude_unset=True)}
 
 
 def read_status(stored: Mapping[str, Any]) -> AssetStatus | ServiceStatus:

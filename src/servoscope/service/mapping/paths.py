@@ -12,11 +12,7 @@ MAX_ROWS = 50_000  # of a message that are read: 1 MiB has 35 000 samples, one e
 ASSET, SIGNAL = "asset", "signal"  # names that mean something; what others hold does not matter
 
 
-class _Missing:
-    """Where nothing is: not even null."""
-
-
-MISSING = _Missing()
+MISSING = object()  # where nothing is: not even null
 
 
 class TextPattern:

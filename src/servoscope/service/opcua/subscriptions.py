@@ -273,7 +273,7 @@ class ScalarSubscription(_Subscription):
         status = value.StatusCode.value if value.StatusCode is not None else 0
         if status & OVERFLOW_BITS == OVERFLOW_BITS:
             self._rejections.add(self.asset, "overflow", f"the server's queue of {self.nodes[node]} was too short")
-        self._assembler.add(node, t, number)
+        self._assembler.resampler.add(node, t, number)
         return t
 
     def emit_blocks(self, alive_until: float) -> None:

@@ -118,10 +118,6 @@ class BlockAssembler:
         values = {"interval_ms": interval_ms, "needed_ms": 1000.0 * self.period}
         return render(message("service.trouble.slow", signal=SIGNALS[signal], **values))
 
-    def add(self, signal: int, t: float, value: float) -> None:
-        """Take a value; NaN where it is known to be bad."""
-        self.resampler.add(signal, t, value)
-
     def collect(self, alive_until: float, settled: float | None = None) -> None:
         """Make the samples that are complete; `alive_until`, `settled`: as in `Resampler.take_samples` [UTC s]."""
         t, values, gaps = self.resampler.take_samples(alive_until, settled)
@@ -147,16 +143,6 @@ class BlockAssembler:
             blocks.append(Block.from_signals(self.asset, self._sequence, signals, time.monotonic()))
             self._t, self._values = self._t[self._size :], self._values[:, self._size :]
         return blocks
-
-    @property
-    def buffered(self) -> int:
-        """How many samples are in no block yet."""
-        return self._t.size
-
-    @property
-    def waiting_times(self) -> FloatArray:
-        """Times of samples and values that are in no block yet, in order, shape (N,) [UTC s]."""
-        return np.sort(np.append(self._t, self.resampler.pending_times))
 
 
 def describe_gap(gap: SampleGap) -> str:
@@ -247,7 +233,7 @@ class AssetStream(BlockAssembler):
             place = self._places[signal]
             if place < 0:
                 continue
-            self.add(place, t, value)
+            self.resampler.add(place, t, value)
             self.rates[place].add(t, value)
             if place < len(SIGNALS):
                 newest[place], sampled = max(newest[place], t), True
@@ -275,12 +261,14 @@ class AssetStream(BlockAssembler):
         if self.trouble is not None:
             self.discard(0, self.trouble.state, self.trouble.why)
         blocks = self.take_blocks(short=short)
-        self._from = last - self.buffered * self.period if math.isfinite(last) else math.nan
+        self._from = last - self._t.size * self.period if math.isfinite(last) else math.nan
         return blocks
 
     def take_closed(self) -> list[Receipt]:
         """Return the messages of which no value waits any more."""
-        times, closed, waiting = self.waiting_times, list[Receipt](), deque[_OpenMessage]()
+        # of samples and values that are in no block yet
+        times = np.sort(np.append(self._t, self.resampler.pending_times))
+        closed, waiting = list[Receipt](), deque[_OpenMessage]()
         for open_message in self.open:
             if open_message.waits(times):
                 waiting.append(open_message)

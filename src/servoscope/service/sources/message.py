@@ -70,17 +70,14 @@ class SourceAsset(NamedTuple):
     is_arm: bool = False  # whether these are all that counts: messages need no r, u and y
 
 
-def _forget() -> None:
-    """Release nothing: the transport keeps no messages."""
-
-
 class InboxMessage(NamedTuple):
     """What a transport has received; `address`: from where."""
 
     address: str
     content: Any  # bytes, or what the transport's library makes of them
     at: float  # when it came, by the monotonic clock [s]
-    release: Callable[[], None] = _forget  # called once all of it is stored or refused: it need not come again
+    # called once all of it is stored or refused: it need not come again; by default the transport keeps no messages
+    release: Callable[[], None] = lambda: None
     is_old: bool = False  # whether it was sent before anybody listened
 
 

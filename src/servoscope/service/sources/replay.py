@@ -62,30 +62,18 @@ class ReplayStream:
     repeat: bool  # whether it begins again
     covariates: tuple[str, ...] = ()  # channels that blocks carry beside r, u and y
 
-    def locate(self, sequence: int) -> tuple[Recording, slice, float] | None:
-        """Return a block's recording, its rows there, and when that recording begins in the stream [s].
-
-        None behind the end.
-        """
+    def block(self, asset: str, sequence: int, stream_start: float) -> Block | None:
+        """Return a block of the stream that began at `stream_start` [UTC s]; None behind the end."""
         counts = [math.ceil(recording.samples / self.block_samples) for recording in self.recordings]
         lengths = [x.t[-1] - x.t[0] + SEPARATION_SAMPLES / x.sample_rate for x in self.recordings]
         rounds, within = divmod(sequence, sum(counts))
         if rounds and not self.repeat:
             return None
-        start = rounds * sum(lengths)
-        for recording, count, length in zip(self.recordings, counts, lengths, strict=True):
-            if within < count:
-                last = min((within + 1) * self.block_samples, recording.samples)
-                return recording, slice(within * self.block_samples, last), start
-            within, start = within - count, start + length
-        raise AssertionError("a block of the round lies in one of its recordings")
-
-    def block(self, asset: str, sequence: int, stream_start: float) -> Block | None:
-        """Return a block of the stream that began at `stream_start` [UTC s]; None behind the end."""
-        place = self.locate(sequence)
-        if place is None:
-            return None
-        recording, rows, start = place
+        start, place = rounds * sum(lengths), 0  # of the recording, in the stream [s]
+        while within >= counts[place]:
+            within, start, place = within - counts[place], start + lengths[place], place + 1
+        recording = self.recordings[place]
+        rows = slice(within * self.block_samples, min((within + 1) * self.block_samples, recording.samples))
         t = stream_start + start + (recording.t[rows] - recording.t[0])
         carried = [recording.channels[name][rows] for name in self.covariates]
         signals = np.stack([t, recording.r[rows], recording.u[rows], recording.y[rows], *carried])

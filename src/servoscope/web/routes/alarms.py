@@ -28,7 +28,7 @@ COMMAND_POLL_S = 0.1
 @router.get("/alarms")
 def list_alarms(context: ContextDep, query: Annotated[AssetQuery, Query()]) -> schemas.AlarmList:
     """List the alarms that are not normal, the most urgent first."""
-    statuses = read_statuses(context.store, [query.asset] if query.asset is not None else None)
+    statuses = read_statuses(context.store, query.assets or None)
     rows = [row for stored in statuses.values() for row in schemas.alarm_rows(stored.name, stored.status.alarms)]
     rows.sort(key=lambda row: (not row.unacknowledged, -row.rank, -row.since, row.asset, row.alarm))
     floods = (status.flood for _, status in service_statuses(statuses.values()))
@@ -63,10 +63,9 @@ def _with_advice(context: Context, row: schemas.AlarmRow, status: AssetStatus | 
 @router.get("/alarms/history")
 def list_transitions(context: ContextDep, query: Annotated[TransitionQuery, Query()]) -> schemas.TransitionList:
     """List transitions of alarms, the newest last."""
-    assets = [query.asset] if query.asset is not None else []
     # the store has no index of alarms: one of them is looked for among all rows
     last = query.last if query.alarm is None else None
-    rows = query_history(context.store, "alarms", assets=assets, span=query.span, last=last)
+    rows = query_history(context.store, "alarms", assets=query.assets, span=query.span, last=last)
     rows = [row for row in rows if query.alarm in (None, row["alarm"])][-query.last :]
     return schemas.TransitionList(transitions=[schemas.TransitionRow.from_stored(row) for row in rows])
 
@@ -105,6 +104,5 @@ async def command_alarm(
 @router.get("/audit")
 def list_audit_entries(context: ContextDep, _: Operator, query: Annotated[AuditQuery, Query()]) -> AuditList:
     """List who did what, the newest last."""
-    assets = [query.asset] if query.asset is not None else []
-    rows = query_history(context.store, "audit", assets=assets, span=query.span, last=query.last)
+    rows = query_history(context.store, "audit", assets=query.assets, span=query.span, last=query.last)
     return AuditList(entries=[AuditEntry.model_validate(row) for row in rows])

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from fastapi import APIRouter, HTTPException, Query, Request, Response
+from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
 
 from servoscope.core.errors import BaselineError, LoopError, StoreError, StoreUnavailableError
 from servoscope.design.operating_limits import OperatingLimit, operating_limits
@@ -56,6 +56,14 @@ def find_asset(context: Context, asset: str) -> tuple[StatusEntry, AssetStatus]:
     raise HTTPException(404, f"there is no asset {asset}")
 
 
+def require_asset(context: ContextDep, asset: str) -> str:
+    """Return the name of an asset that there is; raises HTTPException 404 if there is none."""
+    return find_asset(context, asset)[0].name
+
+
+KnownAsset = Annotated[str, Depends(require_asset)]
+
+
 def build_asset_detail(context: Context, asset: str, at: float, status: AssetStatus) -> schemas.AssetDetail:
     """Return all that is known of an asset now."""
     row = last_full_diagnosis(context, asset) if has_open_fault(status) else None
@@ -99,9 +107,8 @@ def get_asset(context: ContextDep, asset: str) -> schemas.AssetDetail:
 
 
 @router.get("/assets/{asset}/code.svg", response_class=Response, responses=SVG_RESPONSES)
-def get_code(context: ContextDep, request: Request, asset: str) -> Response:
+def get_code(context: ContextDep, request: Request, asset: KnownAsset) -> Response:
     """Return the QR code that leads a phone to its page."""
-    find_asset(context, asset)
     scheme = "https" if context.settings.secure else request.url.scheme
     link = page_address(f"{scheme}://{request.headers['host']}", asset)
     return Response(qr_code(link, "svg"), media_type="image/svg+xml")
@@ -134,9 +141,8 @@ def get_residuals(context: ContextDep, asset: str, query: Annotated[HistoryQuery
 
 
 @router.get("/assets/{asset}/sizes")
-def get_sizes(context: ContextDep, asset: str, query: Annotated[SizeQuery, Query()]) -> responses.SizeHistory:
+def get_sizes(context: ContextDep, asset: KnownAsset, query: Annotated[SizeQuery, Query()]) -> responses.SizeHistory:
     """Return how its faults, or its coefficients, have changed over a time."""
-    find_asset(context, asset)
     kinds = FAULT_KINDS if query.of == "faults" else ("coefficient",)
     series = read_series(context.store, asset, query.span, kinds) if context.store.has_sizes else {}
     columns = ("t", "value", "low", "high", "healthy")
@@ -150,9 +156,8 @@ def get_sizes(context: ContextDep, asset: str, query: Annotated[SizeQuery, Query
 
 
 @router.get("/assets/{asset}/notes")
-def list_notes(context: ContextDep, asset: str) -> responses.NoteList:
+def list_notes(context: ContextDep, asset: KnownAsset) -> responses.NoteList:
     """List what people have noted about it."""
-    find_asset(context, asset)
     return responses.NoteList(notes=[responses.Note.model_validate(note) for note in read_notes(context.store, asset)])
 
 
@@ -169,17 +174,17 @@ def add_note(context: ContextDep, who: Operator, asset: str, request: NoteReques
 
 
 @router.post("/assets/{asset}/checks")
-def write_checks(context: ContextDep, who: Operator, asset: str, request: CheckRequest) -> list[responses.FaultCheck]:
+def write_checks(
+    context: ContextDep, who: Operator, asset: KnownAsset, request: CheckRequest
+) -> list[responses.FaultCheck]:
     """Write what to check on it for a fault, in words of one's own; the audit keeps who did, and what was there."""
-    find_asset(context, asset)
     context.store.add_audit(who.user, asset, CHECKS, request.model_dump())
     return fault_checks(context, asset, asset_loop(context, asset), [request.fault])
 
 
 @router.get("/assets/{asset}/trend")
-def get_trend(context: ContextDep, asset: str, query: Annotated[TrendQuery, Query()]) -> responses.Forecast:
+def get_trend(context: ContextDep, asset: KnownAsset, query: Annotated[TrendQuery, Query()]) -> responses.Forecast:
     """Return how a size grows, and when it will reach a limit; 404 where there is no such size."""
-    find_asset(context, asset)
     try:
         series = query_sizes(context.store, asset, query.name, query.since)
     except StoreUnavailableError:
@@ -191,9 +196,8 @@ def get_trend(context: ContextDep, asset: str, query: Annotated[TrendQuery, Quer
 
 
 @router.get("/assets/{asset}/limits")
-def get_limits(context: ContextDep, asset: str) -> responses.LimitList:
+def get_limits(context: ContextDep, asset: KnownAsset) -> responses.LimitList:
     """Return the sizes at which its loop loses tracking or its margin of stability; none where that is not known."""
-    find_asset(context, asset)
     id_ = asset_baseline_id(context, asset)
     if id_ is None:
         return responses.LimitList(limits=[])
@@ -236,9 +240,8 @@ def _read_blocks(store: Store, asset: str, seconds: float, until: float | None) 
 
 @router.get("/assets/{asset}/alarms")
 def list_asset_transitions(
-    context: ContextDep, asset: str, query: Annotated[RowQuery, Query()]
+    context: ContextDep, asset: KnownAsset, query: Annotated[RowQuery, Query()]
 ) -> schemas.TransitionList:
     """List the transitions of its alarms, the newest last."""
-    find_asset(context, asset)
     rows = query_history(context.store, "alarms", assets=[asset], span=query.span, last=query.last)
     return schemas.TransitionList(transitions=[schemas.TransitionRow.from_stored(row) for row in rows])

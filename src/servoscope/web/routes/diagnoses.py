@@ -48,10 +48,9 @@ def list_diagnoses(context: ContextDep, query: Annotated[DiagnosisQuery, Query()
     """List diagnoses, the newest last."""
     rows: list[responses.DiagnosisRow] = []
     if query.grounds != "upload":
-        assets = [query.asset] if query.asset is not None else []
         # those with the verdict and grounds may be older than the newest rows: then all rows are read
         last = query.last if query.verdict is None and query.grounds is None else None
-        stored = query_history(context.store, "diagnoses", assets=assets, span=query.span, last=last)
+        stored = query_history(context.store, "diagnoses", assets=query.assets, span=query.span, last=last)
         rows = [responses.DiagnosisRow.from_stored(row) for row in stored]
     if query.asset is None and query.grounds in (None, "upload"):
         since, until = query.span

@@ -47,6 +47,11 @@ class AssetQuery(ApiRequest):
 
     asset: Text | None = None
 
+    @property
+    def assets(self) -> list[str]:
+        """Its name; empty: all of them."""
+        return [self.asset] if self.asset is not None else []
+
 
 class FleetQuery(ApiRequest):
     """Which assets to list."""
