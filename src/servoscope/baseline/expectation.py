@@ -77,6 +77,12 @@ def reference_path(recording: Recording, before: tuple[float, float] | None = No
     return ReferencePath(np.ascontiguousarray(r[begin:], dtype=np.float64), kept[begin:] - begin, recording.restart)
 
 
+def reference_piece(recording: Recording, rows: slice, first: int) -> ReferencePath:
+    """Return the reference of a chunk; the run began at sample `first`."""
+    ahead = (float(recording.t[rows.start - 1]), float(recording.r[rows.start - 1])) if rows.start > first else None
+    return reference_path(recording.rows(rows), ahead)
+
+
 def noise_system(pipeline: Pipeline, plant: Plant) -> LinearSystem:
     """Return [n_u, n_y] -> [eta, phi] through the closed loop with a plant.
 

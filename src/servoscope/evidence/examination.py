@@ -13,7 +13,7 @@ import numpy as np
 
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.covariates import CovariatePath
-from servoscope.baseline.expectation import Expectation, ReferencePath, reference_path, residual_noise_model
+from servoscope.baseline.expectation import Expectation, reference_path, reference_piece, residual_noise_model
 from servoscope.baseline.motion import RecordedMotion
 from servoscope.baseline.pressure_model import PressureEvidence
 from servoscope.baseline.residual_model import StretchFit
@@ -301,7 +301,7 @@ class Examination:
         """Return the expected theta_hat at some evaluations, shape (K, n), under a change of plant at a sample."""
         first, start = self.memory_start(at.start), np.array(self.baseline.healthy.theta)
         walk = self.expectation(first, first + 1).propagator(start, self.baseline.plant, plant, max(onset - first, 0))
-        return self._collect(at, first, lambda rows: walk.advance(_reference_piece(self.recording, rows, first)))
+        return self._collect(at, first, lambda rows: walk.advance(reference_piece(self.recording, rows, first)))
 
     def covariance_under(self, at: slice, plant: Plant) -> FloatArray:
         """Return the covariance of theta_hat at some evaluations, shape (K, n, n), under the noise of another plant.
@@ -327,12 +327,6 @@ class Examination:
             k += len(piece)
             outofcore.release(values, *self.recording.columns)
         return values
-
-
-def _reference_piece(recording: Recording, rows: slice, first: int) -> ReferencePath:
-    """Return the reference of a chunk; the run began at sample `first`."""
-    ahead = (float(recording.t[rows.start - 1]), float(recording.r[rows.start - 1])) if rows.start > first else None
-    return reference_path(recording.rows(rows), ahead)
 
 
 def _run_quickly(baseline: Baseline, recording: Recording) -> Examination | None:
@@ -370,7 +364,7 @@ def _run_recursion(
     def healthy(rows: slice) -> FloatArray:
         if walk is None:
             return tuning.theta
-        piece = _reference_piece(recording, rows, 0)
+        piece = reference_piece(recording, rows, 0)
         return np.asarray(walk.advance(piece) + (tuning.theta - np.array(baseline.healthy.theta)))
 
     started = tuning if along is None else replace(tuning, theta=along.start)
