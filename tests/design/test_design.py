@@ -249,18 +249,16 @@ class TestBaselineAlone:
 
 class TestMimics:
     def test_what_is_known_to_look_alike(self, scene: Scenario) -> None:
-        found = {
-            cause.name: (scene.names[i.fault], i) for cause in mimic_causes(scene) for i in [match_mimic(scene, cause)]
-        }
-        name, gain = found["gain of u"]  # K_q goes with the root of p_s
-        assert (name, gain.distinguishable_from) == ("p_s", np.inf)
-        assert gain.size == pytest.approx(2.0, rel=1e-6)
-        assert found["gain of y"][0] == "p_s"
-        name, spring = found["k_p"]  # theta_0 = C_ie k_p
-        assert name == "C_ie"
-        assert spring.cosine[1] == pytest.approx(1.0, abs=1e-3)
-        assert found["delay"][1].distinguishable_from < 0.1
-        assert found["A_p"][1].distinguishable_from < 0.1
+        found = {cause.name: match_mimic(scene, cause) for cause in mimic_causes(scene)}
+        gain = found["gain of u"]  # K_q goes with the root of p_s
+        assert (gain.imitates, gain.told_apart) == ("pump", None)
+        assert np.log(gain.looks_like) / gain.amount == pytest.approx(2.0, rel=1e-6)
+        assert found["gain of y"].imitates == "pump"
+        spring = found["k_p"]  # theta_0 = C_ie k_p
+        assert spring.imitates == "leakage"
+        assert spring.cosines["leakage"] == pytest.approx(1.0, abs=1e-3)
+        for told in (found["delay"].told_apart, found["A_p"].told_apart):
+            assert told is not None and told < 0.1
 
 
 class TestCommand:

@@ -93,5 +93,5 @@ def test_the_design_study_is_as_its_page_says() -> None:
     cells = rows("design", "Detectable sizes")
     assert [size(ratio) for ratio in detected] == [cells[f"pump {way}"][4] for way in ("up", "down")]
     match = match_mimic(scene, mimic_causes(scene)[0])
-    fault = loop.plant.faults[match.fault].name
-    assert rows("mimics", "Mimics")["another mass"][2].startswith(f"{fault}, {match.cosine[match.fault]:.3f}, ")
+    cosine = match.cosines[match.imitates]
+    assert rows("mimics", "Mimics")["another mass"][2].startswith(f"{match.imitates}, {cosine:.3f}, ")

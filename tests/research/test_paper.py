@@ -93,7 +93,7 @@ def test_the_papers_regression_is_equation_4() -> None:
     healthy = PAPER.simulate(loop, 1)
     made = ResidualGenerator.from_loop(loop, healthy)
     g = made.pipeline.regression(healthy.r, healthy.u, healthy.y, healthy.restart)
-    u_a = made.pipeline.input(healthy.r, healthy.u, healthy.restart)
+    u_a = made.pipeline.input(healthy.r, healthy.u, healthy.y, healthy.restart)
     k = 3000
     assert g.eta[k] == pytest.approx(u_a[k] + 3 * u_a[k - 1] + 3 * u_a[k - 2] + u_a[k - 3], rel=1e-9)
     assert g.phi[k] == pytest.approx(healthy.y[k - np.arange(4)])

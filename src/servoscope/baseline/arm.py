@@ -154,6 +154,11 @@ class ArmBaseline(BaselineModel):
         prior[:size, :size] = loosen(np.array(self.information), self.names, np.array(self.theta))
         return prior
 
+    @property
+    def torque_std(self) -> FloatArray:
+        """Standard deviation of what is left of each joint's torque, as it counts for what lasts (n,)."""
+        return np.asarray(np.array(self.noise) * np.sqrt(self.inflation))
+
     @cached_property
     def causes(self) -> tuple[ArmCause, ...]:
         """The changes that are told apart."""
@@ -243,18 +248,14 @@ def complete_columns(model: ArmModel, signals: ArmSignals, theta: FloatArray, te
     `theta`: coefficients, of which the base parameters give the load on the joints; `temperature`: to which friction
     belongs (n,).
     """
-    n, still, at = (
-        model.arm.size,
-        np.zeros_like(signals.q),
-        dict(zip(model.names, range(len(model.names)), strict=True)),
-    )
+    n, still = model.arm.size, np.zeros_like(signals.q)
     motion = (signals.v, signals.a) if model.loop.curve_speed else (still, still)  # as in models that are published
     load = np.abs(model.inertial_torque(signals.q, *motion, theta[: len(model.base.names)]))
-    own = [{what: signals.columns[:, at[f"{name}.{what}"]] for what in FRICTION[:2]} for name in model.arm.names]
-    further = [own[j]["coulomb_friction"] * load[j] for j in range(n)]
+    friction = signals.columns.swapaxes(0, 1)[model.friction_columns]  # (n, 2) columns (n, M)
+    further = [coulomb * load[j] for j, (_, coulomb) in enumerate(friction)]
     for j, joint in enumerate(model.loop.columns_of(model.arm)):
         if joint.temperature is not None:
-            further += [own[j][what] * (signals.temperature[:, j] - temperature[j]) for what in FRICTION[:2]]
+            further += [column * (signals.temperature[:, j] - temperature[j]) for column in friction[j]]
     if model.loop.tool is not None:
         further += [signals.mass[:, index] * signals.tool for index in range(len(PAYLOAD))]
     columns = np.concatenate([signals.columns, np.stack(further, axis=1)], axis=1)
@@ -288,12 +289,9 @@ def deviation_columns(model: ArmModel, signals: ArmSignals, design: FloatArray, 
 
 def deviation_scales(model: ArmModel, theta: FloatArray, torque: FloatArray) -> FloatArray:
     """Return the standard deviation of a change in each direction (D,); `torque`: rms of each joint (n,)."""
-    names = coefficient_names(model)
     scales = list(PAYLOAD_SIZES)
-    for j, (name, joint) in enumerate(zip(model.arm.names, model.loop.columns_of(model.arm), strict=True)):
-        coulomb, viscous = (
-            abs(theta[names.index(f"{name}.{what}")]) for what in ("coulomb_friction", "viscous_friction")
-        )
+    for j, joint in enumerate(model.loop.columns_of(model.arm)):
+        viscous, coulomb = np.abs(theta[model.friction_columns[j]])
         least = 0.01 * torque[j]  # of friction that is nearly none
         scales += [FRICTION_SIZE * max(viscous, least), FRICTION_SIZE * max(coulomb, least), LOAD_SIZE]
         scales += [TORQUE_SIZE * torque[j]] * 3 + [GAIN_SIZE]

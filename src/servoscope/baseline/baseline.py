@@ -26,6 +26,7 @@ from servoscope.baseline.records import (
     RecursionTuning,
     Revision,
     Vector,
+    is_covariance,
     parse_stored_loop,
 )
 from servoscope.baseline.threshold import t2_threshold
@@ -117,9 +118,7 @@ class Baseline(ShortRepr, LearnedEvidence):
             raise ValueError(f"healthy.theta must be empty or have {n} values")
         if not (n and tuning.R > 0.0 and self.thresholds.statistic > 0.0 and min(tuning.scale) > 0.0):
             raise ValueError("names, R, threshold and scale must be positive")
-        C, size = np.array(self.covariance), np.sqrt(np.abs(np.diag(self.covariance)))
-        scaled = C / np.outer(size, size) if size.all() else C
-        if not np.allclose(scaled, scaled.T, atol=1e-6) or np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0] < -1e-9:
+        if not is_covariance(self.covariance):
             raise ValueError("covariance must be symmetric and positive")
         if any(len(fault.deviation) != n for fault in self.learned):
             raise ValueError(f"learned must have deviations of {n} values, one per coefficient")

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 from pydantic import model_validator
 
-from servoscope.baseline.records import BaselineModel, Matrix, Vector
+from servoscope.baseline.records import BaselineModel, Matrix, Vector, is_covariance
 
 SEVERITY = "severity"  # the parameter of a fault that was learned from labelled recordings
 
@@ -31,9 +31,7 @@ class LearnedFault(BaselineModel):
             raise ValueError(f"{self.name}: deviation must not be zero")
         if len(C) != n or any(len(row) != n for row in C):
             raise ValueError(f"{self.name}: covariance must be {n} by {n}")
-        size = np.sqrt(np.maximum(np.diag(C), 0.0))
-        scaled = np.array(C) / np.outer(size, size) if size.all() else -np.eye(n)
-        if not np.allclose(scaled, scaled.T, atol=1e-6) or np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0] < -1e-9:
+        if not (np.diag(C).all() and is_covariance(C)):
             raise ValueError(f"{self.name}: covariance must be symmetric and positive")
         if not self.recordings or len(self.shares) != len(self.recordings):
             raise ValueError(f"{self.name}: shares must have one value per recording")

@@ -28,6 +28,13 @@ LOOP_FIELDS = {"loop", "loop_settings", "recursion"}
 SEPARATE_FIELDS = {"features", "residual", "pressures", "point", "others"}
 
 
+def is_covariance(rows: Matrix) -> bool:
+    """Return whether a square matrix is symmetric and positive, but for rounding."""
+    C, size = np.array(rows), np.sqrt(np.abs(np.diag(rows)))
+    scaled = C / np.outer(size, size) if size.all() else C
+    return np.allclose(scaled, scaled.T, atol=1e-6) and bool(np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0] >= -1e-9)
+
+
 class BaselineModel(BaseModel):
     """What the records of a baseline have in common: frozen, checked, without numbers that JSON cannot hold."""
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from servoscope.core.errors import ObsoleteSettingWarning, ServoscopeError
 
@@ -16,6 +16,15 @@ Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
 NonNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
 NonEmptyStr = Annotated[str, Field(strict=True, min_length=1)]
+
+
+def _check_not_zero(value: float) -> float:
+    if value == 0.0:
+        raise ValueError("must not be 0")
+    return value
+
+
+NOT_ZERO = AfterValidator(_check_not_zero)
 
 
 class Settings(BaseModel):

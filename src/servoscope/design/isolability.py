@@ -42,7 +42,6 @@ class HypothesisDistances:
     others: tuple[Fault, ...]  # the other faults, q of them
     squared: FloatArray  # squared distances, shape (q,)
     sizes: FloatArray  # logarithms of the ratios at which each is closest, shape (q,)
-    residuals: FloatArray  # what each leaves then, in standard deviations, shape (q, N + m)
 
     @property
     def nearest(self) -> str:
@@ -66,8 +65,8 @@ def hypothesis_distances(scene: Scenario, fault: Fault, x: float) -> HypothesisD
         j = scene.names.index(other.parameter)
         guess = x * float(F[i, j] / max(F[j, j], 1e-300))
         closest.append(_closest_hypothesis(scene, window, other, own, guess))
-    left = np.array([residual for _, residual in closest]).reshape(len(others), len(own))
-    return HypothesisDistances(others, (left**2).sum(axis=1), np.array([size for size, _ in closest]), left)
+    sizes, squared = np.array(closest).reshape(-1, 2).T
+    return HypothesisDistances(others, squared, sizes)
 
 
 Span = tuple[float, float]
@@ -146,8 +145,8 @@ def _refine_minima(excess: Callable[[float], float], points: list[tuple[float, f
 
 def _closest_hypothesis(
     scene: Scenario, window: RefitWindow, other: Fault, own: FloatArray, guess: float
-) -> tuple[float, FloatArray]:
-    """Return the size at which another fault comes closest to the truth, and what it leaves, shape (N + m,).
+) -> tuple[float, float]:
+    """Return the size at which another fault comes closest to the truth, and how far from it, squared.
 
     `own` (N + m,) are the innovations of the truth. First with the healthy parameters held, by search; then with all
     free.
@@ -164,7 +163,7 @@ def _closest_hypothesis(
     z, left = minimise_distance(scene, window, [other], own, z, held=True)
     if m:
         z, left = minimise_distance(scene, window, [other], own, z, held=False)
-    return float(z[m]), left
+    return float(z[m]), float(left @ left)
 
 
 def minimise_distance(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,12 +10,13 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 from servoscope.core.messages import Message, message, text_message
 from servoscope.design.fisher_information import MISNAMED, cosines, equivalent_distance
+from servoscope.design.result import MimicStudy
 from servoscope.design.scenario import Scenario
 from servoscope.fit.predictor import Predictor
-from servoscope.isolation.ml.window import COMPLEX_STEP
+from servoscope.isolation.ml.window import COMPLEX_STEP, SENSOR_GAIN
 
 PARALLEL = 1e-6  # 1 - cosine^2 below which two changes are one and the same
-LOUDER = 1e-4  # gain by which one is taken
+AMOUNTS = {"relative": 0.01, "samples": 0.1}  # of mimics
 DELAY_STEP = 0.01  # samples of delay by which the derivative is taken
 
 
@@ -31,17 +33,17 @@ class MimicCause:
 def mimic_causes(scene: Scenario) -> list[MimicCause]:
     """Return what else may change: further parts of the plant, gains of both sensors, the delay."""
     window, plant, m = scene.healthy, scene.baseline.plant, scene.healthy.nuisance_count
-    names = tuple(plant.causes)
+    names = (*plant.causes, SENSOR_GAIN)
     J = window.jacobian(np.zeros(m + len(names)), names, scene.profile, slice(m, None))
-    causes = [MimicCause(name, text_message(plant.causes[name]), "relative", J[:, i]) for i, name in enumerate(names)]
+    causes = [
+        MimicCause(name, text_message(plant.causes[name]), "relative", J[:, i]) for i, name in enumerate(plant.causes)
+    ]
     healthy, factory = window.healthy, window.factory
-    louder, softer = (factory.predictor(plant, output_gain=1.0 + step) for step in (LOUDER, -LOUDER))
     stronger = factory.predictor(plant.model_copy(update={"input_gain": plant.input_gain * (1.0 + 1j * COMPLEX_STEP)}))
     later = factory.predictor(plant, later_s=DELAY_STEP / scene.loop.sample_rate)
-    gain_of_y = (_innovation_column(scene, louder) - _innovation_column(scene, softer)).real / (2.0 * LOUDER)
     return [
         *causes,
-        MimicCause("gain of y", message("design.gain_of_y"), "relative", gain_of_y),
+        MimicCause("gain of y", message("design.gain_of_y"), "relative", J[:, -1]),
         MimicCause(
             "gain of u",
             message("design.gain_of_u"),
@@ -57,19 +59,8 @@ def mimic_causes(scene: Scenario) -> list[MimicCause]:
     ]
 
 
-@dataclass(frozen=True)
-class MimicMatch:
-    """Which fault a cause looks like."""
-
-    cosine: FloatArray  # between both, for each fault, what the healthy parameters can take up left out
-    fault: int  # number of the fault with the largest
-    size: float  # logarithm of its ratio that a unit of the cause looks like
-    # units of the cause from which on it is told from that fault with 99.5 % probability; infinite: never
-    distinguishable_from: float
-
-
-def match_mimic(scene: Scenario, cause: MimicCause) -> MimicMatch:
-    """Return which fault a small change of a cause looks like."""
+def match_mimic(scene: Scenario, cause: MimicCause) -> MimicStudy:
+    """Return which fault a small change of a cause looks like, what the healthy parameters can take up left out."""
     column = scene.project_out_nuisances(cause.column[:, None])
     faults = scene.project_out_nuisances(scene.sensitivity)
     cosine = cosines(column, faults)[0]
@@ -77,8 +68,18 @@ def match_mimic(scene: Scenario, cause: MimicCause) -> MimicMatch:
     size = float(faults[:, i] @ column[:, 0]) / max(float(faults[:, i] @ faults[:, i]), 1e-300)
     own = max(1.0 - float(cosine[i]) ** 2, 0.0)
     length = float(np.linalg.norm(column))
-    told = equivalent_distance(MISNAMED) / (length * np.sqrt(own)) if own > PARALLEL and length > 0.0 else np.inf
-    return MimicMatch(cosine, i, size, float(told))
+    told = equivalent_distance(MISNAMED) / (length * math.sqrt(own)) if own > PARALLEL and length > 0.0 else None
+    amount, names = AMOUNTS[cause.unit], [fault.name for fault in scene.loop.plant.faults]
+    return MimicStudy(
+        name=cause.name,
+        words=cause.words,
+        amount=amount,
+        unit=cause.unit,
+        cosines=dict(zip(names, cosine.tolist(), strict=True)),
+        imitates=names[i],
+        looks_like=float(np.exp(amount * size)),
+        told_apart=told,
+    )
 
 
 def _innovation_column(scene: Scenario, changed: Predictor) -> np.ndarray[tuple[int, ...], np.dtype[np.complex128]]:

@@ -14,7 +14,7 @@ from servoscope.design.scenario import require_exact_predictor
 from servoscope.models.discretise import discretise
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Fault, Plant
-from servoscope.simulation.stability import controller_gains, discrete_closed_loop_poles
+from servoscope.simulation.stability import discrete_closed_loop_poles, require_controller
 
 LimitKind = Literal["tracking", "stability"]
 LIMIT_KINDS: tuple[LimitKind, ...] = get_args(LimitKind)
@@ -87,13 +87,12 @@ def _performance(loop: Loop, plant: Plant) -> tuple[float, float]:
     discrete = discretise(plant.state_space(), loop.sample_rate, hold=loop.hold, delay=loop.delay)
     if np.max(np.abs(discrete_closed_loop_poles(loop, discrete))) >= 1.0:
         return 0.0, 0.0
-    k_p, integrating = controller_gains(loop)
-
+    controller = require_controller(loop)
     frequency = np.geomspace(1e-4, 0.5, FREQUENCIES) * loop.sample_rate
     z = np.exp(2j * np.pi * frequency / loop.sample_rate)
     drive = np.outer(z, discrete.b_next) + discrete.b_now + np.outer(1.0 / z, discrete.b_late)
     states = np.linalg.solve(z[:, None, None] * np.eye(discrete.c.size) - discrete.A, drive[:, :, None])[:, :, 0]
     G = states @ discrete.c * z**-discrete.delay_samples
-    distance = np.abs(1.0 + (k_p + integrating * z / (z - 1.0)) * G)  # 1 / |S|
+    distance = np.abs(1.0 + (controller.k_p + controller.k_i / loop.sample_rate * z / (z - 1.0)) * G)  # 1 / |S|
     poor = np.flatnonzero(distance < np.sqrt(2.0))  # the grid's step, 2 %, is finer than any limit is known
     return float(frequency[poor[0]] if poor.size else frequency[-1]), float(distance.min())

@@ -11,7 +11,6 @@ from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, LoopError, SimulationError
 from servoscope.core.messages import Message, message, text_message
-from servoscope.design import mimics
 from servoscope.design.detectability import AlarmPower, detectable_size
 from servoscope.design.fisher_information import (
     cosines,
@@ -19,6 +18,7 @@ from servoscope.design.fisher_information import (
     linear_isolability_radius,
 )
 from servoscope.design.isolability import ambiguous_sizes, hypothesis_distances
+from servoscope.design.mimics import match_mimic, mimic_causes
 from servoscope.design.operating_limits import LIMIT_KINDS, LimitKind, OperatingLimit, operating_limits
 from servoscope.design.result import (
     BaselineStudy,
@@ -26,7 +26,6 @@ from servoscope.design.result import (
     DirectionStudy,
     FaultPromise,
     FaultStudy,
-    MimicStudy,
     SizePrecision,
 )
 from servoscope.design.scenario import Scenario, require_exact_predictor, require_study
@@ -121,7 +120,6 @@ def _learn_simulated(loop: Loop, r: FloatArray, noise: WhiteNoise) -> Baseline:
 
 
 SECONDS = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)  # after the onset, as far as they are studied
-AMOUNTS = {"relative": 0.01, "samples": 0.1}  # of mimics
 
 
 def study(
@@ -163,7 +161,6 @@ def study(
     columns = scene.project_out_nuisances(scene.sensitivity)
     names = list(faults)
     cosine = cosines(columns, columns)
-    mimics_studied = [_mimic(scene, cause) for cause in mimics.mimic_causes(scene)]
     return DesignStudy(
         loop=scene.loop.name,
         reference=text_message(reference) if isinstance(reference, str) else reference,
@@ -175,7 +172,7 @@ def study(
         false_alarms_per_year=scene.loop.monitor.false_alarms_per_year,
         faults=faults,
         cosines={name: dict(zip(names, map(float, row), strict=True)) for name, row in zip(names, cosine, strict=True)},
-        mimics=tuple(mimics_studied),
+        mimics=tuple(match_mimic(scene, cause) for cause in mimic_causes(scene)),
     )
 
 
@@ -228,21 +225,6 @@ def _nearest_fault(scene: Scenario, fault: Fault, x: float) -> str:
         return hypothesis_distances(scene, fault, x).nearest
     except SimulationError:
         return ""
-
-
-def _mimic(scene: Scenario, cause: mimics.MimicCause) -> MimicStudy:
-    match, amount = mimics.match_mimic(scene, cause), AMOUNTS[cause.unit]
-    names = [fault.name for fault in scene.loop.plant.faults]
-    return MimicStudy(
-        name=cause.name,
-        words=cause.words,
-        amount=amount,
-        unit=cause.unit,
-        cosines=dict(zip(names, match.cosine.tolist(), strict=True)),
-        imitates=names[match.fault],
-        looks_like=float(np.exp(amount * match.size)),
-        told_apart=_finite(match.distinguishable_from),
-    )
 
 
 def _ratio(x: float) -> float | None:

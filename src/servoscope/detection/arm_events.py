@@ -46,21 +46,17 @@ def outside_torque(
     from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
     # all that the friction of a joint may be; at rest it has any sign
-    p, n = len(model.base.names), model.arm.size
-    loads = len(model.names)
-    held = []
-    for j in range(n):
-        coulomb = theta[p + 3 * j + 1]
-        by_load = np.abs(
-            design[j, loads + j] / np.where(design[j, p + 3 * j + 1] == 0.0, np.inf, design[j, p + 3 * j + 1])
-        )
-        held.append(BREAKAWAY * (abs(coulomb) + abs(theta[loads + j]) * by_load))
+    joints = np.arange(model.arm.size)
+    coulomb, by_load = model.friction_columns[:, 1], len(model.names) + joints
+    own = design[joints, coulomb]
+    load = np.abs(design[joints, by_load] / np.where(own == 0.0, np.inf, own))
+    held = BREAKAWAY * (np.abs(theta[coulomb])[:, None] + np.abs(theta[by_load])[:, None] * load)
     period = float(np.median(np.diff(signals.t)))
     rows = max(1, round(EVENT_WINDOW_S / period))
     # of all joints together: some carry no weight
     drives, weight = (np.square(x / noise[:, None]).sum(0) for x in (signals.tau, signals.tau - residual))
     braked = ~signals.moving.any(0) & (drives < BRAKED_SHARE**2 * weight)
-    allowed = np.where(signals.moving, 0.0, np.array(held))
+    allowed = np.where(signals.moving, 0.0, held)
     allowed = np.where(maximum_filter1d(braked, 2 * rows + 1), np.inf, allowed)
     mean = uniform_filter1d(residual, rows, axis=1)
     return np.asarray(np.sign(mean) * np.maximum(np.abs(mean) - allowed, 0.0))

@@ -21,6 +21,7 @@ from servoscope.estimation.arm_regression import (
     MIN_MOVING_S,
     ArmSignals,
     Information,
+    Rows,
     block_information,
     filter_arm_log,
 )
@@ -37,9 +38,6 @@ YEAR_S = 365.25 * 86400.0  # in which one healthy window may be called changed
 ONSET_TAIL = 0.025  # probability on either side of an onset's interval
 ONSET_STEP_S = 0.2  # to which an onset is found: the filters leave no more
 MAX_ONSET_STEPS = 60  # of an onset's interval, longer ones where that is long
-Rows = tuple[
-    FloatArray, FloatArray, FloatArray
-]  # times, weighted columns and residuals, as `block_information` has them
 UNITS = {"offset": "N m", "counterbalance": "N m", "gear ripple": "N m", "encoder offset": "rad"}
 
 
@@ -144,10 +142,9 @@ def _weigh(
     events: list[ArmEvent],
 ) -> tuple[BoolArray, Rows, Information | None, ChangeEvidence | None]:
     """Return which joints moved (n,) outside of events, the weighted rows, and what they say; None where none did."""
-    clear = outside_events(signals.t, events)
-    moved = (signals.moving & clear).sum(1) * float(np.median(np.diff(signals.t))) >= MIN_MOVING_S
-    w = signals.moving * clear / (np.array(baseline.noise) * np.sqrt(baseline.inflation))[:, None]
-    rows = signals.t, columns * w[:, None], residual * w
+    used = replace(signals, moving=signals.moving & outside_events(signals.t, events))
+    moved = used.moving.sum(1) * float(np.median(np.diff(signals.t))) >= MIN_MOVING_S
+    rows = used.weighted(columns, residual, baseline.torque_std)
     if not moved.any():
         return moved, rows, None, None
     information = block_information(*rows)

@@ -109,7 +109,7 @@ class Monitor:
         }
         self._limits = np.array([baseline.thresholds.statistic for baseline in self.baselines])[:, None]
         self._prefix_size = max(
-            constants.prefix_size for constants in self._constants_of
+            constants.pipeline.ahead.size for constants in self._constants_of
         )  # where the state of stage 2 begins
         self._side_at = self._prefix_size + max(recursion.size for _, recursion in self._groups)
         self._sides = SideLanes([constants.side for constants in self._constants_of], self._side_at)
@@ -177,9 +177,7 @@ class Monitor:
             states[assets, self._prefix_size : self._prefix_size + recursion.size] = recursion.start()
         if self._prefix_size:
             for row, constants in zip(states, self._constants_of, strict=True):
-                row[: constants.prefix_size] = np.concatenate(
-                    [constants.pipeline.valve.start(), constants.stage.start()]
-                )
+                row[: constants.pipeline.ahead.size] = constants.pipeline.ahead.start()
         self._sides.start(states)
         return states if self.fleet else states[0]
 
@@ -308,9 +306,7 @@ class Monitor:
         """Return u behind valve law and stage 1, whose states are changed in place."""
         flow = np.empty_like(u)
         for i, constants in enumerate(self._constants_of):
-            valve = constants.pipeline.valve
-            behind_valve = valve.run(rows[i, : valve.size], u[i], y[i], flags[i])
-            flow[i] = constants.stage.run(rows[i, valve.size : constants.prefix_size], r[i], behind_valve, flags[i])
+            flow[i] = constants.pipeline.ahead.run(rows[i], r[i], u[i], y[i], flags[i])
         return flow
 
     def _follow_sides(

@@ -17,7 +17,6 @@ from servoscope.estimation import frequency_response
 from servoscope.estimation.frequency_response import FrequencyResponse
 from servoscope.estimation.pipeline import Pipeline
 from servoscope.estimation.recursion import EvaluationConstants, RecursionConstants
-from servoscope.estimation.two_stage import StageOneRunner
 
 
 def compatibility_key(baseline: Baseline) -> tuple[Hashable, ...]:
@@ -31,8 +30,6 @@ class MonitorConstants:
     """The part of a monitor that comes from one baseline and never changes."""
 
     pipeline: Pipeline
-    stage: StageOneRunner
-    prefix_size: int  # of the states of valve law and stage 1
     constants: RecursionConstants
     expected_theta: FloatArray
     healthy: FrequencyResponse
@@ -41,7 +38,7 @@ class MonitorConstants:
     @classmethod
     def from_baseline(cls, baseline: Baseline) -> MonitorConstants:
         """Derive the constants; the bias under the baseline's references is taken out of estimate and expectation."""
-        pipeline, stage = baseline.pipeline(), StageOneRunner(baseline.loop, baseline.recursion.stage_one)
+        pipeline, side = baseline.pipeline(), SideMonitors(baseline, baseline.pipeline())
         frequencies, expected = baseline.loop.monitor.frequencies, np.array(baseline.theta) - baseline.bias
         E = pipeline.bank.E(frequencies)
         response = np.stack([E.real, E.imag], axis=1).reshape(2 * len(E), -1)
@@ -52,8 +49,7 @@ class MonitorConstants:
         healthy = frequency_response.frequency_response(
             pipeline.bank, frequencies, expected, baseline.covariance_array()
         )
-        prefix_size, side = pipeline.valve.size + stage.size, SideMonitors(baseline, pipeline)
-        return cls(pipeline, stage, prefix_size, constants, expected, healthy, side)
+        return cls(pipeline, constants, expected, healthy, side)
 
 
 def deduplicate(values: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:

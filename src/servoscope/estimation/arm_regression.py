@@ -30,6 +30,8 @@ MIN_MOVING_S = 2.0  # of a joint that moves
 ANGLE_STEP = 1e-4  # rad or m: of the difference quotient that is the direction of an encoder's offset
 MAX_BLOCKS = 600  # in which a recording is divided
 BLOCK_S = 1.0
+# times (M,), columns (n, D, M) and residuals (n, M), as `block_information` has them
+Rows = tuple[FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +48,11 @@ class ArmSignals:
     moving: BoolArray  # (n, M)
     temperature: FloatArray  # (M, n)
     tool: FloatArray  # (M,) [kg]
+
+    def weighted(self, columns: FloatArray, residual: FloatArray, std: FloatArray) -> Rows:
+        """Return columns and residual over a standard deviation (n,), 0 where a joint rests."""
+        w = self.moving / std[:, None]
+        return self.t, columns * w[:, None], residual * w
 
 
 def filter_arm_log(recording: ArmRecording, model: ArmModel) -> ArmSignals:

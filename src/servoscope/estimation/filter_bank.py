@@ -22,6 +22,7 @@ from servoscope.models.lti import (
 )
 from servoscope.models.plants import SIGN_CUTOFF, Column, Plant
 from servoscope.simulation.measurement import FeedForward
+from servoscope.simulation.stability import close_loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,28 +102,9 @@ def closed_loop_system(loop: Loop, plant: Plant) -> LinearSystem:
     """
     if loop.controller is None or not plant.has_physics:
         raise LoopError(f"{loop.name}: the nominal closed loop needs [controller] and the plant's nominal values")
-    dt = 1.0 / loop.sample_rate
-    G = sample_system(plant.state_space(), loop.sample_rate, loop.hold, loop.delay)
-    k_p, k_i = loop.controller.k_p, loop.controller.k_i
-    n = len(G.A)
-    # states [x, s], s the sum of past errors; rows below act on [x, s, r, n_u, n_y]. With y = c x + d (u + n_u) + n_y
-    # and u = gain e + k_i s, the error follows from one linear equation.
-    gain, d = k_p + k_i * dt, float(G.D[0, 0])
-    identity = np.eye(n + 4)
-    s, r, n_u, n_y = identity[n:]
-    output = np.zeros(n + 4)
-    output[:n] = G.C[0]
-    e = (r - output - d * n_u - n_y - d * k_i * s) / (1.0 + d * gain)
-    u = gain * e + k_i * s
-    y = output + d * (u + n_u) + n_y
-    x_next = np.hstack([G.A, np.zeros((n, 4))]) + np.outer(G.B[:, 0], u + n_u)
-    both = np.vstack([x_next, s + dt * e])
-    if not k_i:  # the sum is not used then: its pole at 1 must not count
-        both[n, :n], both[n, n], both[n, n + 1 :] = 0.0, 0.0, 0.0
-    if np.abs(np.linalg.eigvals(both[:, : n + 1])).max() >= 1.0:
+    loop_itself = close_loop(loop, sample_system(plant.state_space(), loop.sample_rate, loop.hold, loop.delay))
+    if np.abs(np.linalg.eigvals(loop_itself.A)).max() >= 1.0:
         raise LoopError(f"{loop.name}: the closed loop is unstable, check [plant] and [controller]")
-    outputs = np.vstack([u, y])
-    loop_itself = LinearSystem(both[:, : n + 1], both[:, n + 1 :], outputs[:, : n + 1], outputs[:, n + 1 :])
     if not loop.controller.k_v:
         return loop_itself
     feed = FeedForward(loop)

@@ -78,6 +78,23 @@ class Estimates:
         return float(skipped / max(skipped + updated, 1.0))
 
 
+class InputStage:
+    """The valve's law and stage 1, which come before the bank; their states are one array (size,)."""
+
+    def __init__(self, loop: Loop, stage_one: StageOneTuning | None) -> None:
+        self.valve, self._stage = ValveLaw(loop), StageOneRunner(loop, stage_one)
+        self.size = self.valve.size + self._stage.size
+
+    def start(self) -> FloatArray:
+        """Return the state before the first sample, shape (size,)."""
+        return np.concatenate([self.valve.start(), self._stage.start()])
+
+    def run(self, state: FloatArray, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> FloatArray:
+        """Return the input of the bank for the next block, shape (N,), and change `state` in place."""
+        flow = self.valve.run(state[: self.valve.size], u, y, restart)
+        return self._stage.run(state[self.valve.size : self.size], r, flow, restart)
+
+
 @dataclass(frozen=True, eq=False)
 class Pipeline:
     """A loop, its filter bank, stage 1 if it has one, and the speed below which it rests; build it with `of`."""
@@ -182,7 +199,7 @@ class Pipeline:
         rows[0] -= theta @ rows[1 : 1 + bank.n]
         edges = np.array([loop.input_deadzone or (np.inf, -np.inf), loop.input_limits or (-np.inf, np.inf)])
         dead, limits = map(tuple, loop.plant.effective_input(edges).tolist())
-        unlimited = loop.input_logged == "after_limiter" or self.valve.size  # a valve law limits u itself
+        unlimited = loop.input_logged == "after_limiter" or self.ahead.valve.size  # a valve law limits u itself
         lags, heads = tuning.noise.chain()
         return RecursionConstants(
             estimator=name,
@@ -222,15 +239,14 @@ class Pipeline:
         noise = ArmaNoise(np.zeros(1), np.zeros(0), np.ones(1), 1.0)
         return Tuning(np.zeros(n), np.ones(n), np.eye(n), 1.0, noise)
 
-    def input(self, r: FloatArray, u: FloatArray, restart: BoolArray) -> FloatArray:
-        """Return the input of the regression, shape (N,): u_a of stage 1, or u itself without one."""
-        stage = StageOneRunner(self.loop, self.stage_one)
-        return stage.run(stage.start(), r, u, restart)
+    def input(self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> FloatArray:
+        """Return the input of the regression, shape (N,): flow of the valve, u_a of stage 1, or u itself."""
+        return self.ahead.run(self.ahead.start(), r, u, y, restart)
 
     @cached_property
-    def valve(self) -> ValveLaw:
-        """The law of the valve, before all else; it lets u pass where the law is linear."""
-        return ValveLaw(self.loop)
+    def ahead(self) -> InputStage:
+        """What u passes before the bank."""
+        return InputStage(self.loop, self.stage_one)
 
     @cached_property
     def _behind_valve(self) -> LinearSystem:
@@ -240,10 +256,6 @@ class Pipeline:
         instrument = instrument_model(self.loop, self.instrument) if self.bank.has_instrument else None
         inner = self.loop.model_copy(update={"delay": self.loop.delay - integer_delay(self.loop)})
         return filter_bank.build_filter_bank(inner, instrument).system
-
-    def flow(self, u: FloatArray, y: FloatArray, restart: BoolArray) -> FloatArray:
-        """Return the flow of the valve, shape (N,); u itself where its law is linear."""
-        return self.valve.run(self.valve.start(), u, y, restart)
 
     @cached_property
     def kinematics(self) -> Pipeline:
@@ -330,16 +342,14 @@ class RegressionRunner:
     """
 
     def __init__(self, pipeline: Pipeline, state: FloatArray | None = None) -> None:
-        self._pipeline, self._ahead = pipeline, _InputStage(pipeline)
-        if state is None:
-            state = np.concatenate([self._ahead.state, pipeline._plain.start()[0]])
-        self.state, size = state, len(self._ahead.state)
-        self._ahead.state, self._state = state[:size], state[size:]
+        self._pipeline, size = pipeline, pipeline.ahead.size
+        self.state = np.concatenate([pipeline.ahead.start(), pipeline._plain.start()[0]]) if state is None else state
+        self._ahead, self._state = self.state[:size], self.state[size:]
 
     def advance(self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> Regression:
         """Return the regression of the next block, each input of shape (N,)."""
-        bank = self._pipeline.bank
-        out, ok = self._pipeline._plain.regressors(self._state, r, self._ahead.input(r, u, y, restart), y, restart)
+        bank, u = self._pipeline.bank, self._pipeline.ahead.run(self._ahead, r, u, y, restart)
+        out, ok = self._pipeline._plain.regressors(self._state, r, u, y, restart)
         phi = out[:, 1 : 1 + bank.n].copy()
         return Regression(out[:, 0], phi, out[:, -bank.n :].copy() if bank.has_instrument else phi, ok == 1)
 
@@ -348,7 +358,7 @@ class EstimationRunner:
     """Runs the recursion block by block, from the tuning's theta, to the same result wherever a recording is cut."""
 
     def __init__(self, pipeline: Pipeline, tuning: Tuning, watch: CusumConstants | None = None) -> None:
-        self._pipeline, self._ahead = pipeline, _InputStage(pipeline)
+        self._pipeline, self._ahead = pipeline, pipeline.ahead.start()
         self._constants = pipeline.constants(tuning, watch)
         self._recursion = Recursion([self._constants])
         self._state = self._recursion.start()
@@ -356,27 +366,13 @@ class EstimationRunner:
     def again(self) -> Self:
         """Return one at the first sample, whose constants are these."""
         other = copy.copy(self)
-        other._ahead, other._state = _InputStage(self._pipeline), self._recursion.start()
+        other._ahead, other._state = self._pipeline.ahead.start(), self._recursion.start()
         return other
 
     def advance(self, block: Recording) -> Estimates:
         """Return the estimates of the next block; their samples count from the first block on."""
         r, y, restart = block.r, block.y, block.restart
-        u = self._ahead.input(r, block.u, y, restart)
+        u = self._pipeline.ahead.run(self._ahead, r, block.u, y, restart)
         index = self._recursion.rows(self._state, block.samples)
         self._state, out = self._recursion.run(self._state, r[None], u[None], y[None], restart[None])
         return self._pipeline.unpack(self._constants, out[0], index)
-
-
-class _InputStage:
-    """The valve's law and stage 1, which come before the bank, with their state."""
-
-    def __init__(self, pipeline: Pipeline) -> None:
-        self._valve, self._stage = pipeline.valve, StageOneRunner(pipeline.loop, pipeline.stage_one)
-        self.state = np.concatenate([self._valve.start(), self._stage.start()])
-
-    def input(self, r: FloatArray, u: FloatArray, y: FloatArray, restart: BoolArray) -> FloatArray:
-        """Return the input of the bank for the next block, shape (N,)."""
-        size = self._valve.size
-        flow = self._valve.run(self.state[:size], u, y, restart)
-        return self._stage.run(self.state[size:], r, flow, restart)

@@ -16,6 +16,7 @@ import numpy as np
 
 from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.estimation.noise_model import WhiteNoise
+from servoscope.fit.kernels import samples_since_restart
 from servoscope.fit.predictor import MAX_GAIN_SAMPLES, Predictor, PredictorFactory
 from servoscope.fit.search import Experiment, Fit
 from servoscope.fit.tuning import sandwich_covariance, sum_covariance
@@ -72,7 +73,7 @@ class PlantExperiment:
         u = plant_input(loop, logged)
         y = np.concatenate([rec.y[head] for rec, head in zip(recordings, heads, strict=True)])
         restart = np.concatenate([begun(rec.restart[head]) for rec, head in zip(recordings, heads, strict=True)])
-        rows = np.flatnonzero(samples_since(restart) > latest)
+        rows = np.flatnonzero(samples_since_restart(restart, latest + 2) > latest)
         base = loop.model_copy(update={"plant": plant, "delay": 0.0})
         return cls(
             loop,
@@ -150,7 +151,7 @@ class PlantExperiment:
     @cached_property
     def age(self) -> IndexArray:
         """Samples since a restart, as far as the gains change with them, shape (N,)."""
-        return np.minimum(samples_since(self.restart), MAX_GAIN_SAMPLES - 1)
+        return samples_since_restart(self.restart, MAX_GAIN_SAMPLES)
 
     @property
     def _nominal_offset(self) -> float:
@@ -186,12 +187,6 @@ def begun(restart: BoolArray) -> BoolArray:
     first = restart.copy()
     first[:1] = True
     return first
-
-
-def samples_since(restart: BoolArray) -> IndexArray:
-    """Return the samples since the last restart, shape (N,); the first sample is one."""
-    at = np.arange(len(restart))
-    return np.asarray(at - np.maximum.accumulate(np.where(restart, at, 0)))
 
 
 def plant_input(loop: Loop, u: FloatArray) -> FloatArray:

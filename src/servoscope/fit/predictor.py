@@ -82,12 +82,10 @@ class PredictorFactory:
         _, (scale, _) = matrix_balance(loop.plant.state_space()[0], permute=False, separate=True)
         return cls(loop, noise, np.asarray(scale, dtype=np.float64), float(np.sqrt((u**2).mean())))
 
-    def predictor(
-        self, plant: Plant, output_gain: float = 1.0, later_s: float = 0.0, noise: WhiteNoise | None = None
-    ) -> Predictor:
+    def predictor(self, plant: Plant, later_s: float = 0.0, noise: WhiteNoise | None = None) -> Predictor:
         """Return the predictor of a plant, as `predictors` does of several."""
         A, B, C = plant.state_space()
-        return self.predictors((A[None], B[None], C[None]), np.array([output_gain]), later_s, noise)
+        return self.predictors((A[None], B[None], C[None]), np.ones(1), later_s, noise)
 
     def predictors(
         self, state_spaces: StateSpace, output_gains: Array, later_s: float = 0.0, noise: WhiteNoise | None = None

@@ -39,7 +39,7 @@ from servoscope.estimation.arm_regression import (
     filter_arm_log,
 )
 from servoscope.learning.arm_setup import nominal_gains
-from servoscope.models.arm.model import FRICTION, ArmModel
+from servoscope.models.arm.model import ArmModel
 from servoscope.models.arm.settings import ArmLoop
 from servoscope.models.arm.urdf import Kinematics
 from servoscope.signals.readers.arm_log import ArmRecording
@@ -198,7 +198,7 @@ def _learn_scatter(
         inflation = _inflation(signals, columns, left, fit.noise, len(fit.theta))
         weight = fit.noise * np.sqrt(inflation)
         whole = [
-            block_information(signal.t, *weighted(signal, X, e, weight))
+            block_information(*signal.weighted(X, e, weight))
             for signal, X, e in zip(signals, columns, residuals, strict=True)
         ]
         changes = [_change(information, moves) for information in whole]
@@ -242,14 +242,6 @@ def _judge_each(
     return limits, notes if several else [message("arm.few_recordings", least=MIN_RECORDINGS)]
 
 
-def weighted(
-    signals: ArmSignals, columns: FloatArray, residual: FloatArray, weight: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return columns (n, D, M) and residual (n, M) over a standard deviation (n,), 0 where a joint rests."""
-    w = signals.moving / weight[:, None]
-    return columns * w[:, None], residual * w
-
-
 def _start(model: ArmModel) -> FloatArray:
     """Return the coefficients (P,) before anything was measured: those of the URDF."""
     start = np.zeros(len(coefficient_names(model)))
@@ -271,7 +263,7 @@ def _fit(model: ArmModel, signals: Sequence[ArmSignals], designs: Sequence[Float
     noise = np.sqrt((np.square(tau) * moving).sum(1) / moving.sum(1))
     for _ in range(FIT_STEPS):
         pieces = [
-            block_information(signal.t, *weighted(signal, X, signal.tau, noise), np.inf)
+            block_information(*signal.weighted(X, signal.tau, noise), np.inf)
             for signal, X in zip(signals, designs, strict=True)
         ]
         A, b = np.array([piece.A[0] for piece in pieces]), np.array([piece.g[0] for piece in pieces])
@@ -294,16 +286,12 @@ def _check_motion(model: ArmModel, signals: Sequence[ArmSignals]) -> None:
 
 def _check_signs(model: ArmModel, theta: FloatArray, std: FloatArray, name: str) -> None:
     """Refuse friction that drives: the sign of a torque or of a gear is wrong."""
-    names = coefficient_names(model)
-    friction = {}
-    for joint in model.arm.names:
-        viscous, coulomb = (names.index(f"{joint}.{what}") for what in FRICTION[:2])
-        friction[joint] = (theta[viscous] / std[viscous], theta[coulomb] / std[coulomb])
-    worst = min(friction, key=lambda joint: sum(friction[joint]))
-    if sum(friction[worst]) < 0.0 and min(friction[worst]) < MAX_REVERSED:
+    friction = (theta / std)[model.friction_columns]
+    worst = int(friction.sum(1).argmin())
+    if friction[worst].sum() < 0.0 and friction[worst].min() < MAX_REVERSED:
         raise RecordingError(
-            f"{name}: {worst}: its friction comes out negative, so position and torque have opposite signs: give it a"
-            " negative gain, or correct its gear or its axis in the URDF"
+            f"{name}: {model.arm.names[worst]}: its friction comes out negative, so position and torque have opposite"
+            " signs: give it a negative gain, or correct its gear or its axis in the URDF"
         )
 
 
@@ -323,8 +311,8 @@ def _inflation(
         A: FloatArray | float = 0.0
         G: FloatArray | float = 0.0
         for signal, X, e in zip(signals, columns, residuals, strict=True):
-            Xw, ew = weighted(signal, X[:, first:], e, noise)
-            blocks = block_information(signal.t, Xw[j : j + 1], ew[j : j + 1], INFLATION_BLOCK_S)
+            t, Xw, ew = signal.weighted(X[:, first:], e, noise)
+            blocks = block_information(t, Xw[j : j + 1], ew[j : j + 1], INFLATION_BLOCK_S)
             A, G = A + blocks.A.sum(0), G + blocks.g.T @ blocks.g
         values, vectors = np.linalg.eigh(np.asarray(A) / (size := np.sqrt(np.diag(A)) + 1e-300) / size[:, None])
         kept = values > 1e-6 * values[-1]
@@ -336,11 +324,7 @@ def _inflation(
 def _undetermined(model: ArmModel, theta: FloatArray, std: FloatArray) -> list[str]:
     """Return the friction terms that the motion leaves open; those of a joint together are what counts."""
     names = coefficient_names(model)
-    undetermined = []
-    for joint in model.arm.names:
-        viscous, coulomb = (names.index(f"{joint}.{what}") for what in ("viscous_friction", "coulomb_friction"))
-        undetermined += [names[i] for i in (viscous, coulomb) if std[i] > MAX_FRICTION_STD * abs(theta[i])]
-    return undetermined
+    return [names[i] for i in model.friction_columns.ravel() if std[i] > MAX_FRICTION_STD * abs(theta[i])]
 
 
 def _mounting_notes(
@@ -360,11 +344,9 @@ def _mounting_notes(
         for signal, X in zip(signals, designs, strict=True):
             rigid = turned.inertial_torque(signal.q, signal.v, signal.a, turned.base.nominal)
             left_over = signal.tau - rigid
-            own = np.concatenate([X[:, p:]], axis=1)
-            flat = own.transpose(0, 2, 1)
             for j in range(n):
-                used = flat[j][:, np.abs(flat[j]).max(0) > 0.0]
-                scaled = np.column_stack([used, rigid[j]])
+                used = X[j, p:][np.abs(X[j, p:]).max(1) > 0.0]
+                scaled = np.column_stack([*used, rigid[j]])
                 total[j] += float(np.square(left_over[j] - scaled @ np.linalg.lstsq(scaled, left_over[j])[0]).sum())
         left[tuple(np.round(direction, 3).tolist())] = float(np.sum(total / fit.noise**2))
     given = next(iter(left.values()))

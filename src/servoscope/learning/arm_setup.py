@@ -182,10 +182,10 @@ def calibrate_load(baseline: ArmBaseline, recording: ArmRecording, mass: float) 
     own = np.zeros((n, n, len(PAYLOAD), signals.t.size))  # what the load adds to each joint alone
     own[range(n), range(n)] = signals.mass
     columns = [design, baseline.deviations(signals, design), own.reshape(n, -1, signals.t.size)]
-    w = signals.moving / (np.array(baseline.noise) * np.sqrt(baseline.inflation))[:, None]
     if not signals.moving.any():
         raise NotEnoughError(f"{recording.name}: the arm does not move, give a log of moves with the load")
-    whole = block_information(signals.t, np.concatenate(columns, axis=1) * w[:, None], residual * w, np.inf)
+    rows = signals.weighted(np.concatenate(columns, axis=1), residual, baseline.torque_std)
+    whole = block_information(*rows, np.inf)
     first, prior = n * len(PAYLOAD), baseline.random_effect
     A, g, others = whole.A[0], whole.g[0], whole.A[0][:-first, :-first] + prior
     gain = np.linalg.solve(others, A[:-first, -first:])

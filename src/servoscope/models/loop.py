@@ -125,10 +125,13 @@ class MonitorSettings(Settings):
     frequencies: Annotated[tuple[Positive, ...], Field(min_length=1)] = DEFAULT_FREQUENCIES
     false_alarms_per_year: Positive = 1.0  # budget that the alarm is set for, after its delays
     # share of healthy recordings that the features beside the coefficients may call changed; 0: no features
-    feature_false_alarms: Annotated[float, Field(ge=0.0, le=0.5)] = FEATURE_FALSE_ALARMS
-    covariate_hold_s: Positive = COVARIATE_HOLD_S  # how long a value of a covariate holds without a new one [s]
+    feature_false_alarms: Annotated[
+        float, Field(ge=0.0, le=0.5, exclude_if=lambda value: value == FEATURE_FALSE_ALARMS)
+    ] = FEATURE_FALSE_ALARMS
+    # how long a value of a covariate holds without a new one [s]
+    covariate_hold_s: Annotated[Positive, Field(exclude_if=lambda value: value == COVARIATE_HOLD_S)] = COVARIATE_HOLD_S
     # whether coefficients follow a warm-up that no column tells
-    hidden_warm_up: bool = False
+    hidden_warm_up: bool = Field(default=False, exclude_if=lambda value: not value)
     on_delay: NonNegative = 0.0  # how long a limit must be exceeded before the alarm is raised [s]
     # how long the alarm stays after the limit was exceeded last [s]; None: for the memory
     off_delay: NonNegative | None = None
@@ -153,7 +156,7 @@ class Loop(ShortRepr, Settings):
     input_deadzone: Interval | None = None  # range [lo, hi] of u in which the valve is shut
     # what `learn` does with coefficients that no machine has, or that explain less than half of u: ``note`` where u
     # only stands in for the force of the drive
-    implausible: Literal["refuse", "note"] = "refuse"
+    implausible: Literal["refuse", "note"] = Field(default="refuse", exclude_if=lambda value: value == "refuse")
     # columns, plant, controller, monitor: the sections of the file; the controller is optional
     columns: Columns = Columns()
     plant: SerializeAsAny[plants.Plant]
@@ -352,19 +355,11 @@ class Loop(ShortRepr, Settings):
     def to_dict(self) -> dict[str, Any]:
         """Return nested plain values, ready for JSON, that `from_dict` turns into an equal loop."""
         plain: dict[str, Any] = self.model_dump(mode="json")
-        # came later: hashes of loops without them stay as they were
+        # came later, as what `exclude_if` leaves out: hashes of loops without them stay as they were
         for key in ("text", "resample", "time_zone", "covariates"):
             if not plain["columns"][key]:
                 del plain["columns"][key]
-        if self.implausible == "refuse":
-            del plain["implausible"]
         del plain["monitor"]["memory" if self.monitor.memory_samples else "memory_samples"]
-        if self.monitor.feature_false_alarms == FEATURE_FALSE_ALARMS:
-            del plain["monitor"]["feature_false_alarms"]  # came later: files and hashes of loops without it stay
-        if not self.monitor.hidden_warm_up:
-            del plain["monitor"]["hidden_warm_up"]
-        if self.monitor.covariate_hold_s == COVARIATE_HOLD_S:
-            del plain["monitor"]["covariate_hold_s"]
         return {key: value for key, value in plain.items() if value is not None}
 
     def hash(self) -> str:

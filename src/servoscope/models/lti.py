@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
-from servoscope.models.discretise import discretise
+from servoscope.models.discretise import DiscretePlant, discretise
 from servoscope.models.plants import StateSpace
 
 MAX_RICCATI_ITERATIONS = 20_000  # of a Riccati equation, at most
@@ -248,7 +248,12 @@ def sample_system(
     input as logged to the outputs ``C x`` at the sample times.
     """
     A, B, C = continuous
-    d = discretise((A, B, C[:1]), sample_rate, hold=hold, delay=late)
+    return input_to_output(discretise((A, B, C[:1]), sample_rate, hold=hold, delay=late), C)
+
+
+def input_to_output(d: DiscretePlant, C: FloatArray | None = None) -> LinearSystem:
+    """Return a discrete plant as a system from the input as logged to its output, or to ``C x``."""
+    C = d.c[None] if C is None else C
     # x(k+1) needs w(k+1) under a first-order hold: the state xi = x - b_next w carries that sample into D
     now = (d.A @ d.b_next + d.b_now)[:, None]
     if np.any(d.b_late):

@@ -15,7 +15,7 @@ from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 from servoscope.simulation.faults import FaultEvent
 from servoscope.simulation.linear_kernels import ControllerConstants
-from servoscope.simulation.stability import controller_gains
+from servoscope.simulation.stability import require_controller
 
 NOISE_U_STD = 1e-4
 NOISE_Y_STD = float(np.sqrt(1e-7))
@@ -71,14 +71,14 @@ def make_recording(loop: Loop, r: FloatArray, u: FloatArray, y: FloatArray) -> R
 
 def controller_constants(loop: Loop) -> ControllerConstants:
     """Return controller, limits, dead zone and delay of a loop as plain numbers."""
-    k_p, integral_gain = controller_gains(loop)
+    controller = require_controller(loop)
     low, high = loop.input_limits or (-np.inf, np.inf)
     deadzone = loop.input_deadzone or (np.inf, -np.inf)
     delay, backward = split_delay(loop.delay, loop.sample_rate), loop.plant.retraction_gain
     if backward != 1.0 and loop.hold != "zoh":
         raise SimulationError(f"loop {loop.name!r}: two areas are simulated with a held u, set hold = 'zoh'")
     gains = (backward, 1.0) if loop.plant.input_gain > 0.0 else (1.0, backward)
-    return ControllerConstants(k_p, integral_gain, low, high, *deadzone, *delay, *gains)
+    return ControllerConstants(controller.k_p, controller.k_i / loop.sample_rate, low, high, *deadzone, *delay, *gains)
 
 
 class FeedForward:
@@ -89,9 +89,9 @@ class FeedForward:
     """
 
     def __init__(self, loop: Loop) -> None:
-        k_p, integral_gain = controller_gains(loop)
-        assert loop.controller is not None
-        speed_gain, gain = loop.controller.k_v * loop.sample_rate, k_p + integral_gain
+        controller = require_controller(loop)
+        k_p, integral_gain = controller.k_p, controller.k_i / loop.sample_rate
+        speed_gain, gain = controller.k_v * loop.sample_rate, k_p + integral_gain
         if integral_gain:
             self.denominator = np.array([1.0, -k_p / gain, 0.0])
             self.numerator = self.denominator + speed_gain / gain * np.array([1.0, -2.0, 1.0])

@@ -13,6 +13,7 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
 from servoscope.models.discretise import discretise
 from servoscope.models.loop import Loop
+from servoscope.models.lti import LinearSystem
 from servoscope.models.plants import Plant, StateSpace
 from servoscope.models.plants.eha import EHA
 from servoscope.signals import Recording
@@ -234,15 +235,10 @@ def _prepend_valve(system: StateSpace, rig: Rig) -> StateSpace:
     """Put the valve's dynamics in front of a linear plant."""
     if rig.valve_hz is None:
         return system
-    A, B, C = system
-    n, w = len(A), 2.0 * np.pi * rig.valve_hz
-    whole = np.zeros((n + 2, n + 2))
-    whole[:n, :n], whole[:n, n] = A, B[:, 0]
-    whole[n, n + 1] = 1.0
-    whole[n + 1, n:] = -w * w, -2.0 * rig.valve_damping * w
-    drive = np.zeros((n + 2, 1))
-    drive[n + 1] = w * w
-    return whole, drive, np.hstack([C, np.zeros((1, 2))])
+    w, nothing = 2.0 * np.pi * rig.valve_hz, np.zeros((1, 1))
+    A, B = np.array([[0.0, 1.0], [-w * w, -2.0 * rig.valve_damping * w]]), np.array([[0.0], [w * w]])
+    whole = LinearSystem(A, B, np.eye(1, 2), nothing).then(LinearSystem(*system, nothing))
+    return whole.A, whole.B, whole.C
 
 
 def _rig_constants(plant: EHA, rig: Rig, loop: Loop, rows: FloatArray) -> dict[str, Any]:

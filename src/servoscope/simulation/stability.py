@@ -7,18 +7,19 @@ import numpy.typing as npt
 
 from servoscope.core.errors import SimulationError
 from servoscope.models.discretise import DiscretePlant, discretise
-from servoscope.models.loop import Loop
+from servoscope.models.loop import Controller, Loop
+from servoscope.models.lti import LinearSystem, input_to_output
 from servoscope.models.plants import Plant
 
 
-def controller_gains(loop: Loop) -> tuple[float, float]:
-    """Return k_p and k_i T of the controller.
+def require_controller(loop: Loop) -> Controller:
+    """Return the controller.
 
     Raises SimulationError if the loop has no controller.
     """
     if loop.controller is None:
         raise SimulationError(f"loop {loop.name!r} has no [controller]: a simulation needs one, kind, k_p and k_i")
-    return loop.controller.k_p, loop.controller.k_i / loop.sample_rate
+    return loop.controller
 
 
 def closed_loop_poles(loop: Loop, plant: Plant | None = None) -> npt.NDArray[np.complex128]:
@@ -28,7 +29,7 @@ def closed_loop_poles(loop: Loop, plant: Plant | None = None) -> npt.NDArray[np.
 
     Raises SimulationError if the loop has no controller; raises LoopError if the plant has no nominal values.
     """
-    controller_gains(loop)
+    require_controller(loop)
     plant = loop.plant if plant is None else plant
     return discrete_closed_loop_poles(
         loop, discretise(plant.state_space(), loop.sample_rate, hold=loop.hold, delay=loop.delay)
@@ -42,42 +43,36 @@ def settling_samples(loop: Loop, plant: Plant, share: float) -> int:
 
 
 def discrete_closed_loop_poles(loop: Loop, discrete: DiscretePlant) -> npt.NDArray[np.complex128]:
-    """Return the closed-loop poles of a plant that is discretised already.
-
-    The state is [w, s, u(k-1) ... u(k-m-1)], w the plant's state without the present u, s = k_i T sum e up
-    to k-1.
-    """
-    k_p, integrating = controller_gains(loop)
-    gain = k_p + integrating
-    n, m, c = discrete.c.size, discrete.delay_samples, discrete.c
-    size = n + 1 + m + 1
-    share = float(c @ discrete.b_next) if m == 0 else 0.0
-    # u as a row of the state: from u = gain e + s, e = -c w - share u.
-    u = np.zeros(size)
-    u[:n], u[n] = -gain * c, 1.0
-    u /= 1.0 + gain * share
-    e = -share * u
-    e[:n] -= c
-    past = np.eye(size)[n + 1 :]  # row i is u(k-1-i)
-    acting = [u, *past]
-    state = np.eye(size)[:n]
-    if m == 0:
-        state = state + np.outer(discrete.b_next, u)
-    loop_matrix = np.zeros((size, size))
-    loop_matrix[:n] = (
-        discrete.A @ state + np.outer(discrete.b_now, acting[m]) + np.outer(discrete.b_late, acting[m + 1])
-    )
-    if m > 0:
-        loop_matrix[:n] += np.outer(discrete.b_next, acting[m - 1])
-    loop_matrix[n] = np.eye(size)[n] + integrating * e
-    loop_matrix[n + 1] = u
-    loop_matrix[n + 2 :] = past[:-1]
-    if integrating == 0.0:  # the sum stays 0: its pole at 1 is none of the loop
-        loop_matrix = np.delete(np.delete(loop_matrix, n, axis=0), n, axis=1)
+    """Return the closed-loop poles of a plant that is discretised already."""
     # States in SI differ by ten decades, which eigvals evens out itself only in part.
     from scipy.linalg import matrix_balance
 
-    return np.asarray(np.linalg.eigvals(matrix_balance(loop_matrix)[0]), dtype=np.complex128)
+    A = close_loop(loop, input_to_output(discrete)).A
+    if not require_controller(loop).k_i:  # the sum stays 0: its pole is none of the loop
+        A = A[:-1, :-1]
+    return np.asarray(np.linalg.eigvals(matrix_balance(A)[0]), dtype=np.complex128)
+
+
+def close_loop(loop: Loop, plant: LinearSystem) -> LinearSystem:
+    """Put the PI controller around a sampled plant from u as logged to y: [r, n_u, n_y] -> [u, y as measured].
+
+    Its states are those of the plant, and the sum of past errors. Raises SimulationError if the loop has no controller.
+    """
+    controller, dt, n = require_controller(loop), 1.0 / loop.sample_rate, len(plant.A)
+    # rows below act on [x, s, r, n_u, n_y]. With y = c x + d (u + n_u) + n_y and u = gain e + k_i s, the error follows
+    # from one linear equation.
+    k_i, d = controller.k_i, float(plant.D[0, 0])
+    gain = controller.k_p + k_i * dt
+    s, r, n_u, n_y = np.eye(n + 4)[n:]
+    output = np.zeros(n + 4)
+    output[:n] = plant.C[0]
+    e = (r - output - d * n_u - n_y - d * k_i * s) / (1.0 + d * gain)
+    u = gain * e + k_i * s
+    y = output + d * (u + n_u) + n_y
+    x_next = np.hstack([plant.A, np.zeros((n, 4))]) + np.outer(plant.B[:, 0], u + n_u)
+    s_next = s + dt * e if k_i else np.zeros(n + 4)  # where the sum is not used, its pole at 1 must not count
+    both, outputs = np.vstack([x_next, s_next]), np.vstack([u, y])
+    return LinearSystem(both[:, : n + 1], both[:, n + 1 :], outputs[:, : n + 1], outputs[:, n + 1 :])
 
 
 def check_stable(loop: Loop, discrete: DiscretePlant, what: str) -> None:

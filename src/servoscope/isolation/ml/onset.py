@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servoscope.core.arrays import FloatArray, IntArray
+from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.isolation.ml.hypothesis import HypothesisFit
 from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow
 from servoscope.isolation.posterior import INTERVAL
@@ -64,15 +64,10 @@ def onset_posterior(
         grids.append(drifting)
     onsets, overs, cost, prior, moved = (np.concatenate([getattr(t, name) for t in grids]) for name in vars(grids[0]))
     likelihood = np.exp(-0.5 * (cost - cost.min()) / noise_variance)
-    order = np.argsort(onsets, kind="stable")
-    share = np.cumsum((likelihood * prior)[order])
-    low, high = (int(onsets[order][np.searchsorted(share, q * share[-1])]) for q in INTERVAL)
-    # at rest no onset is better than another: what is nearly as likely as the best belongs to it, its edge too
-    alike = onsets[cost <= cost.min() + ONSET_COST_QUANTILE * noise_variance]
-    low, high = min(low, int(alike.min())), max(high, int(alike.max()))
+    weight = likelihood * prior
+    low, high = onset_interval(onsets, weight, cost <= cost.min() + ONSET_COST_QUANTILE * noise_variance)
     # the best of so many drifts beats the best step easily: all of them together are compared
     steps = overs == 0
-    weight = likelihood * prior
     kind = steps if weight[steps].sum() >= weight[~steps].sum() else ~steps
     best = int(np.argmax(np.where(kind, likelihood, 0.0)))
     spread = np.sqrt(np.average((moved - moved[best]) ** 2, axis=0, weights=weight))
@@ -82,6 +77,17 @@ def onset_posterior(
         high,
         dict(zip(fit.names, spread.tolist(), strict=True)),
     )
+
+
+def onset_interval(onsets: IntArray, weight: FloatArray, alike: BoolArray) -> tuple[int, int]:
+    """Return the 95 % interval of an onset: of some (M,), how likely each is, and which are nearly as good as the best.
+
+    At rest no onset is better than another: what is nearly as likely as the best belongs to it, its edge too.
+    """
+    order = np.argsort(onsets, kind="stable")
+    share = np.cumsum(weight[order])
+    low, high = (int(onsets[order][np.searchsorted(share, q * share[-1])]) for q in INTERVAL)
+    return min(low, int(onsets[alike].min())), max(high, int(onsets[alike].max()))
 
 
 def _step_grid(table: ChangeCosts, latest: int, noise_variance: float) -> _ChangeGrid:

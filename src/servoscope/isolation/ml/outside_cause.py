@@ -9,14 +9,19 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray, IntArray
 from servoscope.isolation.ml.hypothesis import MAX_EXCESS_SQUARES, HypothesisFit, refit_jointly
-from servoscope.isolation.ml.onset import ONSET_COST_QUANTILE, POSTERIOR_SHARE, OnsetEstimate, onset_posterior
+from servoscope.isolation.ml.onset import (
+    ONSET_COST_QUANTILE,
+    POSTERIOR_SHARE,
+    OnsetEstimate,
+    onset_interval,
+    onset_posterior,
+)
 from servoscope.isolation.ml.other_causes import CauseWindow, OtherCause, causes_at, parameter_cause
 from servoscope.isolation.ml.result import RefitResult
 from servoscope.isolation.ml.search import MAX_LOOKS
 from servoscope.isolation.ml.start_values import fit_further_parameters
 from servoscope.isolation.ml.timeline import MAX_BRIDGE, bridge_height
 from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow
-from servoscope.isolation.posterior import INTERVAL
 
 FIT_TOLERANCE = 6.0  # of the sum of squares; a likelihood 20 times smaller is not as good
 MIN_EXPLAINED_SHARE = 0.95  # of what the healthy plant does not explain
@@ -112,7 +117,7 @@ def _disturbance_onset(
 
 
 def _onset_interval(cost: Callable[[int], float], onset: int, latest: int, variance: float) -> tuple[int, int]:
-    """Return the 95 % interval of an onset, by the same rule as `onset_posterior`."""
+    """Return the 95 % interval of an onset."""
     least, negligible = cost(onset), 2.0 * float(np.log(1.0 / POSTERIOR_SHARE)) * variance
     ends = []
     for way, edge in ((-1, 0), (1, latest)):
@@ -124,7 +129,4 @@ def _onset_interval(cost: Callable[[int], float], onset: int, latest: int, varia
     costs: FloatArray = np.array([cost(int(k)) for k in onsets]) - least
     # each stands for the samples half-way to its neighbours
     width = np.gradient(onsets.astype(np.float64)) if len(onsets) > 1 else np.ones(1)
-    share = np.cumsum(np.exp(-0.5 * costs / variance) * width)
-    low, high = (int(onsets[np.searchsorted(share, q * share[-1])]) for q in INTERVAL)
-    alike = onsets[costs <= ONSET_COST_QUANTILE * variance]
-    return min(low, int(alike.min())), max(high, int(alike.max()))
+    return onset_interval(onsets, np.exp(-0.5 * costs / variance) * width, costs <= ONSET_COST_QUANTILE * variance)

@@ -41,6 +41,17 @@ class Delay(InspectionModel):
     configured_samples: float
     words: MessageText
 
+    @classmethod
+    def within(cls, samples: float, low: float, high: float, rate: float, configured: float, gain: float) -> Delay:
+        """Return a delay with its interval; the interval alone where it is too wide."""
+        flat = message("inspection.delay_flat", low=low, high=high)
+        interval = cls(low_samples=low, high_samples=high, configured_samples=configured, words=flat)
+        if high - low > MAX_INTERVAL_SAMPLES:
+            return interval
+        words = message("inspection.delay_value", samples=samples, ms=1e3 * samples / rate, low=low, high=high)
+        values = {"samples": samples, "seconds": samples / rate, "gain": max(gain, 0.0)}
+        return interval.model_copy(update={**values, "identifiable": True, "words": words})
+
 
 def estimate_delay(
     recording: Recording, g: Regressors, which: IndexArray, fitted: RegressionFit, independent: float
@@ -117,17 +128,4 @@ def _locate_minimum(d: FloatArray, J: FloatArray, configured: float, independent
     half = math.sqrt(2.0 * (level - least) / max(curvature, PARABOLA * least))
     low = min(samples - half, float(d[below[0]])) if below.size else samples - half
     high = max(samples + half, float(d[below[-1]])) if below.size else samples + half
-    gain = 1.0 - least / float(np.interp(configured, d, J))
-    if high - low > MAX_INTERVAL_SAMPLES:
-        words = message("inspection.delay_flat", low=low, high=high)
-        return Delay(low_samples=low, high_samples=high, configured_samples=configured, words=words)
-    return Delay(
-        samples=samples,
-        seconds=samples / rate,
-        low_samples=low,
-        high_samples=high,
-        gain=max(gain, 0.0),
-        identifiable=True,
-        configured_samples=configured,
-        words=message("inspection.delay_value", samples=samples, ms=1e3 * samples / rate, low=low, high=high),
-    )
+    return Delay.within(samples, low, high, rate, configured, 1.0 - least / float(np.interp(configured, d, J)))

@@ -235,15 +235,8 @@ def _check_delay(estimate: delay.Delay, recording: Recording, loop: Loop | None,
         return estimate
     rate = recording.sample_rate
     samples, half = exact.seconds * rate, 1.96 * exact.std_s * rate
-    low, high = samples - half, samples + half
-    if 2.0 * half > delay.MAX_INTERVAL_SAMPLES:
-        words = message("inspection.delay_flat", low=low, high=high)
-        return delay.Delay(
-            low_samples=low, high_samples=high, configured_samples=estimate.configured_samples, words=words
-        )
-    words = message("inspection.delay_value", samples=samples, ms=1e3 * exact.seconds, low=low, high=high)
-    values = {"samples": samples, "seconds": exact.seconds, "low_samples": low, "high_samples": high, "words": words}
-    return estimate.model_copy(update=values | {"gain": estimate.gain if exact.significant else 0.0})
+    gain = estimate.gain if exact.significant else 0.0
+    return delay.Delay.within(samples, samples - half, samples + half, rate, estimate.configured_samples, gain)
 
 
 def _suggested_cutoff(spectra: Spectra | None, coherent: float | None, noise: float, rate: float) -> float:

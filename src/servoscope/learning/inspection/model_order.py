@@ -84,7 +84,7 @@ def form_regressors(recording: Recording, loop: Loop, delay: float | None = None
     bank = filter_bank.build_filter_bank(loop)
     pipeline = Pipeline(loop, bank)
     constants = pipeline.constants(pipeline.blank())._replace(stride=1)  # here, every sample counts
-    u = pipeline.flow(recording.u, recording.y, recording.restart)
+    u = pipeline.input(recording.r, recording.u, recording.y, recording.restart)
     recursion = Recursion([constants])
     rows, said = recursion.regressors(recursion.start()[0], recording.r, u, recording.y, recording.restart)
     return Regressors(loop, bank, rows[:, 0], rows[:, 1 : 1 + bank.n], said == USED)

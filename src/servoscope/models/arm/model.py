@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servoscope.core.arrays import FloatArray
+from servoscope.core.arrays import FloatArray, IndexArray
 from servoscope.models.arm.dynamics import LINK_PARAMETERS, torque_regressor
 from servoscope.models.arm.settings import ArmLoop
 from servoscope.models.arm.urdf import Kinematics
@@ -105,6 +105,11 @@ class ArmModel:
         ]
         curves = [f"{joint}.friction_curve" for joint in self.arm.names] if self.loop.curve_speed else []
         return (*self.base.names, *own, *motors, *curves)
+
+    @property
+    def friction_columns(self) -> IndexArray:
+        """Which columns hold viscous and Coulomb friction of each joint, (n, 2)."""
+        return np.asarray(len(self.base.names) + 3 * np.arange(self.arm.size)[:, None] + np.arange(2))
 
     def columns(self, q: FloatArray, v: FloatArray, a: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the columns of the regression, (n, P, N), and those of a mass at the last joint, (n, 4, N).

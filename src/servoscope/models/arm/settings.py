@@ -8,11 +8,20 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import LoopError
-from servoscope.core.settings import Finite, NonEmptyStr, NonNegative, Positive, Settings, parse_toml, read_toml_text
+from servoscope.core.settings import (
+    NOT_ZERO,
+    Finite,
+    NonEmptyStr,
+    NonNegative,
+    Positive,
+    Settings,
+    parse_toml,
+    read_toml_text,
+)
 from servoscope.core.settings_errors import describe_error
 from servoscope.models.arm.dynamics import STANDARD_GRAVITY
 from servoscope.models.arm.urdf import Kinematics, parse_urdf
@@ -22,18 +31,12 @@ OF_ALL_JOINTS = ("velocity", "target", "target_torque")  # columns that all join
 DEFAULT_CUTOFF = 5.0  # Hz; the motion of an arm lies below, the ripple of its gears above
 
 
-def _not_zero(value: float) -> float:
-    if value == 0.0:
-        raise ValueError("must not be 0")
-    return value
-
-
 class JointColumns(Settings):
     """Where the signals of one joint stand in a log: columns, or linear combinations of columns."""
 
     position: NonEmptyStr  # angle or travel of the joint, or of its motor where `gears` are given
     torque: NonEmptyStr  # motor current, or torque
-    gain: Annotated[Finite, AfterValidator(_not_zero)] = 1.0  # drive gain [N m per unit of `torque`]
+    gain: Annotated[Finite, NOT_ZERO] = 1.0  # drive gain [N m per unit of `torque`]
     offset: Finite = 0.0  # added to the position, for a zero other than the URDF's [rad or m]
     temperature: NonEmptyStr | None = None  # of the joint, on which its friction may depend
     velocity: NonEmptyStr | None = None  # as the position, used where it is less noisy than its derivative

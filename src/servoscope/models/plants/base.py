@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import LoopError
+from servoscope.core.settings import NOT_ZERO
 from servoscope.models.plants.columns import COLUMN_UNITS, Column
 
 StateSpace = tuple[FloatArray, FloatArray, FloatArray]
@@ -29,12 +30,6 @@ def matrices(rows: Sequence[Sequence[Any]], count: int) -> Any:
         for j, entry in enumerate(row):
             stack[:, i, j] = entry
     return stack
-
-
-def _not_zero(value: float) -> float:
-    if value == 0.0:
-        raise ValueError("must not be 0")
-    return value
 
 
 @dataclass(frozen=True)
@@ -110,7 +105,7 @@ class Plant(BaseModel, abc.ABC):
 
     kind: str  # name of the plant in a loop file
     # factor on u as recorded, before anything else is done with it, for example a torque constant
-    input_gain: Annotated[float, AfterValidator(_not_zero), Field(allow_inf_nan=False)] = 1.0
+    input_gain: Annotated[float, NOT_ZERO, Field(allow_inf_nan=False)] = 1.0
 
     # of the loop file, no setting of the plant's own table
     _rays: tuple[FaultRay, ...] = PrivateAttr(default=())
@@ -294,14 +289,16 @@ class Plant(BaseModel, abc.ABC):
         Raises LoopError if no nominal value is known.
         """
 
-    @abc.abstractmethod
     def state_space(self) -> StateSpace:
         """Continuous linear part from u as recorded to y: A (n, n), B (n, 1), C (1, n), in physical states.
 
-        The states keep their meaning when a parameter changes, so a switch of plants carries them over.
+        The states keep their meaning when a parameter changes, so a switch of plants carries them over. A plant has
+        this, or `state_spaces`.
 
         Raises LoopError if no nominal values are known.
         """
+        A, B, C = self.state_spaces({}, 1)
+        return A[0], B[0], C[0]
 
     def state_spaces(self, factors: Mapping[str, Any], count: int) -> StateSpace:
         """Return the `state_space` of so many plants at once: A (count, n, n), B (count, n, 1), C (count, 1, n).

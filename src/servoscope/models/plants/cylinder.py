@@ -49,54 +49,62 @@ EXPONENTS: dict[str, dict[str, float]] = {
 """Parameters that move several coefficients; the flow through an edge is g x sqrt(p_S - p_load) (Merritt, 1967)."""
 
 VALVE_CHECKS = "valve: contamination, worn edges, amplifier; its flow at a given pressure drop"
-# parameter -> name of the fault, range that is searched, what it means, what to check
-FAULTS: dict[str, tuple[str, tuple[float, float], str, str]] = {
-    "supply_pressure": (
+FAULTS = (
+    Fault(
         "supply",
+        "supply_pressure",
         (0.3, 2.0),
         "another supply pressure",
         "pump, relief valve, filter and accumulator: pressure at rest and in motion",
     ),
-    "gain_forward": ("valve_forward", (0.3, 3.0), "another flow of the valve forward", VALVE_CHECKS),
-    "gain_backward": ("valve_backward", (0.3, 3.0), "another flow of the valve backward", VALVE_CHECKS),
-    "load": (
+    Fault("valve_forward", "gain_forward", (0.3, 3.0), "another flow of the valve forward", VALVE_CHECKS),
+    Fault("valve_backward", "gain_backward", (0.3, 3.0), "another flow of the valve backward", VALVE_CHECKS),
+    Fault(
         "friction",
+        "load",
         (0.5, 3.0),
         "more u for the same speed, whatever the load: friction",
         "rod seal, guide and bearing: alignment, lubrication, side load",
     ),
-    "leakage": (
+    Fault(
+        "leakage",
         "leakage",
         (0.05, 50.0),
         "more u to hold a load: leakage of piston or valve",
         "piston seal and valve edges: warm cylinder, drift under load with the valve shut, oil return flow",
     ),
-    "overlap": (
+    Fault(
+        "overlap",
         "overlap",
         (0.1, 20.0),
         "more u before anything moves: overlap of the valve, hysteresis, static friction",
         "valve: worn edges, its zero, contamination; amplifier: dead band",
     ),
-    "acceleration": (
+    Fault(
         "lag",
+        "acceleration",
         (1.0, 20.0),
         "u comes late: a slow spool, a heavier load",
         "valve: pilot pressure, contamination, amplifier; mass that is moved",
     ),
-    "jerk": ("air", (1.0, 20.0), "softer oil: air", "oil: air in it, foam, water, age; oil level and suction line"),
-    "offset": (
+    Fault(
+        "air", "jerk", (1.0, 20.0), "softer oil: air", "oil: air in it, foam, water, age; oil level and suction line"
+    ),
+    Fault(
         "zero",
+        "offset",
         (0.1, 10.0),
         "more u at rest: zero of the valve, another load at rest",
         "valve: zero and its amplifier; a load that hangs",
     ),
-    "process": (
+    Fault(
         "process_force",
+        "process",
         (0.1, 10.0),
         "another process force, which is no fault of the cylinder",
         "process: product, tool, material",
     ),
-}
+)
 
 
 class Pressures(Settings):
@@ -116,10 +124,11 @@ class CylinderPlant(TermPlant):
           = c v + spring abs(v) y + process abs(v) [y > contact] + overlap sign(v) + ... + offset
     """
 
+    faults: ClassVar[tuple[Fault, ...]] = FAULTS  # of some no term shows anything, which `learn` says
     EXPONENTS: ClassVar[Mapping[str, Mapping[str, float]]] = EXPONENTS
     # the root of the load pressure is of first order here, so that large changes move other terms too
     ray_angles: ClassVar[Mapping[str, float]] = {
-        **dict.fromkeys(FAULTS, 0.1),
+        **dict.fromkeys((fault.parameter for fault in FAULTS), 0.1),
         **dict.fromkeys(("supply_pressure", "load", "offset"), 0.05),
         "overlap": 0.25,
         "process": 0.3,
@@ -173,13 +182,6 @@ class CylinderPlant(TermPlant):
     def unwatched(self) -> tuple[str, ...]:
         """What no term shows."""
         return ("backlash", *(() if "overlap" in self.terms else ("coulomb_friction",)))
-
-    @property
-    def faults(self) -> tuple[Fault, ...]:
-        """Changes by name; of some no term shows anything, which `learn` says."""
-        return tuple(
-            Fault(name, parameter, range_, words, checks) for parameter, (name, range_, words, checks) in FAULTS.items()
-        )
 
     def exponents(self, parameter: str, healthy: Mapping[str, float] | None = None) -> Mapping[str, float]:
         """Return the powers by coefficient; a force weighs more where it acts on the smaller area.

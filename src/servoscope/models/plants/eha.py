@@ -176,16 +176,11 @@ class EHA(Plant):
             moved["A_b"] = self.A_b * factors["A_p"]
         return self.model_copy(update=moved)
 
-    def state_space(self) -> StateSpace:
-        """Return A (3, 3), B (3, 1), C (1, 3), states y [m], y' [m/s], p_L [Pa]; integrates if k_p = 0.
+    def state_spaces(self, factors: Mapping[str, Any], count: int) -> StateSpace:
+        """Return those of so many actuators at once; states y [m], y' [m/s], p_L [Pa], integrating if k_p = 0.
 
         Where the actuator is not `linear` this is the linear part: flow at p_L = 0, no Coulomb friction.
         """
-        A, B, C = self.state_spaces({}, 1)
-        return A[0], B[0], C[0]
-
-    def state_spaces(self, factors: Mapping[str, Any], count: int) -> StateSpace:
-        """Return those of so many actuators at once: their parameters are arrays."""
         eha = self.scaled(factors)
         m_p, capacity = eha.m_p, eha.capacity
         A = [

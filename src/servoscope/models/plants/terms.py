@@ -159,16 +159,11 @@ class TermPlant(Plant):
                 polynomial[1 - self.derivative] = polynomial[1 - self.derivative] + 0.5 * nominal[column.coefficient]
         return polynomial
 
-    def state_space(self) -> StateSpace:
-        """Continuous linear part: A (n, n), B (n, 1), C (1, n), n the order; states y and its derivatives.
+    def state_spaces(self, factors: Mapping[str, Any], count: int) -> StateSpace:
+        """Return those of so many plants at once, n the order; states y and its derivatives.
 
         Friction by direction enters with the mean of both directions; all other columns are left out.
         """
-        A, B, C = self.state_spaces({}, 1)
-        return A[0], B[0], C[0]
-
-    def state_spaces(self, factors: Mapping[str, Any], count: int) -> StateSpace:
-        """Return those of so many plants at once: their coefficients are arrays."""
         *lower, leading = self.scaled(factors)._polynomial()
         n = len(lower)
         A = [*np.eye(n, k=1)[:-1].tolist(), [-value / leading for value in lower]]

@@ -85,7 +85,7 @@ class ResidualGenerator:
             recursion.named(state)["theta"] = -c.theta
             recursion.named(state)["P"] *= INITIAL_COVARIANCE_FACTOR
         r, restart = recording.r, recording.restart
-        u, y = pipeline.input(r, recording.u, restart), self.output(recording)
+        u, y = pipeline.input(r, recording.u, recording.y, restart), self.output(recording)
         _, out = recursion.run(state, r[None], u[None], y[None], restart[None])
         index = recursion.rows(state, recording.samples)
         theta = pipeline.unpack(c, out[0], index).theta

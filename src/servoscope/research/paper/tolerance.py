@@ -19,7 +19,7 @@ from servoscope.research.paper.tracking import TUNING_SEED_OFFSET
 from servoscope.signals import Recording
 from servoscope.simulation import closed_loop_poles, simulate_response
 from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD, draw_noise
-from servoscope.simulation.stability import controller_gains
+from servoscope.simulation.stability import require_controller
 
 CASES = (FaultCase("p_s", 0.6), FaultCase("beta", 0.005))
 DIAGNOSIS_DELAY_S = 5.0  # s between the alarm and the diagnosis that the manager acts on
@@ -50,14 +50,13 @@ def reschedule_gains(loop: Loop, plant: Plant) -> Controller:
     Of a grid of gains around the present ones, those count that leave the loop stable; the output under the paper's
     reference is compared. A change of the flow gain alone is made up for exactly, by the inverse change of k_p.
     """
-    k_p, integrating = controller_gains(loop)
-    k_i = integrating * loop.sample_rate
+    present = require_controller(loop)
     r = PAPER.reference_signal()[:1000]
     wanted = simulate_response(loop, r)[1]
-    best, controller = np.inf, Controller(kind="pi", k_p=k_p, k_i=k_i)
+    best, controller = np.inf, present
     for gain in GAINS:
         for integral in INTEGRALS:
-            tried = Controller(kind="pi", k_p=k_p * gain, k_i=k_i * integral * gain)
+            tried = Controller(kind="pi", k_p=present.k_p * gain, k_i=present.k_i * integral * gain)
             with_it = loop.model_copy(update={"controller": tried, "plant": plant})
             if np.abs(closed_loop_poles(with_it)).max() >= 1.0:
                 continue
@@ -82,7 +81,8 @@ def simulate_gain_change(
     healthy, faulty = (
         discretise(plant.state_space(), loop.sample_rate, hold="zoh") for plant in (loop.plant, fault_plant)
     )
-    k_p, integrating = controller_gains(loop)
+    present = require_controller(loop)
+    k_p, integrating = present.k_p, present.k_i / loop.sample_rate
     total = 0.0
     x = np.zeros(len(healthy.c))
     u, y = np.empty(r.size), np.empty(r.size)

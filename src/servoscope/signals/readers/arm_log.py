@@ -12,7 +12,6 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import RecordingError
 from servoscope.models.arm.settings import ArmLoop
 from servoscope.models.arm.urdf import Kinematics
-from servoscope.models.loop import Columns
 from servoscope.signals.readers.frames import Source
 from servoscope.signals.readers.recording_file import read_channels
 from servoscope.signals.resample import ResampleTarget, resample_rows
@@ -54,15 +53,7 @@ def read_arm_log(path: Source | Path, loop: ArmLoop, arm: Kinematics) -> ArmReco
     Raises RecordingError if the log cannot be used.
     """
     joints = loop.columns_of(arm)
-    columns = Columns(
-        time=loop.time,
-        time_unit=loop.time_unit,
-        reference=joints[0].position,
-        input=joints[0].torque,
-        output=joints[0].position,
-        covariates=loop.channels,
-    )
-    name, stamps, channels = read_channels(path, columns)
+    name, stamps, channels = read_channels(path, loop.carrier.columns)
     axis = build_time_axis(stamps, None, None, name, regular=False)
     ordered = {key: axis.reorder(channel) for key, channel in channels.items()}
     whole = np.isfinite(np.array(list(ordered.values()))).all(0)
