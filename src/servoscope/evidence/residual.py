@@ -39,16 +39,20 @@ ACCELERATION_QUANTILES = (1.0 / 3.0, 2.0 / 3.0)  # braking, neither, acceleratin
 
 
 def _learn(healthy: HealthyRecordings, draft: Baseline) -> Learned:
-    """Learn the residual, unless an exact plant leaves noise alone: the tests of the coefficients know its size."""
-    exact = draft.exact is not None and draft.exact.misfit <= 1.0
-    if exact or healthy.loop.monitor.hidden_warm_up:
+    """Learn the residual, unless an exact plant leaves noise alone: the tests of the coefficients know its size.
+
+    Of an axis only fits to whole recordings are compared, by their motion: changes within them are scanned for.
+    """
+    exact, is_axis = draft.exact is not None and draft.exact.misfit <= 1.0, draft.axis is not None
+    if exact or healthy.loop.monitor.hidden_warm_up or (is_axis and healthy.covariates is not None):
         return None, ()
-    return learn_residuals(healthy, np.array(draft.theta)), ()
+    return learn_residuals(healthy, np.array(draft.theta), by_motion=is_axis), ()
 
 
-def learn_residuals(healthy: HealthyRecordings, theta: FloatArray) -> ResidualModel | None:
+def learn_residuals(healthy: HealthyRecordings, theta: FloatArray, *, by_motion: bool = False) -> ResidualModel | None:
     """Learn the residuals about coefficients (n,), and limits from each recording judged by the others.
 
+    `by_motion`: whether what no term explains repeats with the motion, so that fits are compared with those of like it.
     None where too few recordings have another one of their motion.
     """
     share, recordings, pipeline = healthy.loop.monitor.feature_false_alarms, healthy.recordings, healthy.pipeline
@@ -77,11 +81,14 @@ def learn_residuals(healthy: HealthyRecordings, theta: FloatArray) -> ResidualMo
     if len(whole) < MIN_RECORDINGS:
         return None
     limits = score_limit(whole, share), SHIFT_MARGIN * score_limit(shift, PAST_BUDGET * share)
-    fits = _learn_fits(healthy, theta, origin, share) if healthy.loop.plant.fits_stretches else {}
+    fitted = by_motion or healthy.loop.plant.fits_stretches
+    fits = _learn_fits(healthy, theta, origin, share, by_motion) if fitted else {}
     return _learn_model(layout, pipeline, recordings).model_copy(update={"limits": limits, **fits})
 
 
-def _learn_fits(healthy: HealthyRecordings, theta: FloatArray, origin: float, share: float) -> dict[str, object]:
+def _learn_fits(
+    healthy: HealthyRecordings, theta: FloatArray, origin: float, share: float, by_motion: bool
+) -> dict[str, object]:
     """Return how fits to halves of recordings scatter about theta (n,), and a limit from each recording left out."""
     regressions, m = healthy.regressions, len(healthy.regressions)
     rms = np.sqrt(np.mean([(g.phi[g.ok] ** 2).mean(axis=0) for g in regressions], axis=0))
@@ -91,12 +98,12 @@ def _learn_fits(healthy: HealthyRecordings, theta: FloatArray, origin: float, sh
         return {**known, "halves": to_tuples(further_covariance(left[:, 1:], m))}
     left[:, 0] *= m / (m - 1.0)  # theta without a recording is off by as much more from it
     like = None
-    if healthy.loop.plant.repeats_with_motion:
+    if by_motion:
         parts = [(rec, *(rec.rows(rows) for rows in _halves(rec.samples))) for rec in healthy.recordings]
         motions = np.array([[rms_motion(healthy.pipeline, part, origin) for part in rec] for rec in parts])
-        common = fits[:, :1] - left[:, :1]
-        known_fits = np.where(np.isfinite(fits), fits, np.where(np.isfinite(common), common, theta))
-        left = fits - _expected_by_others(known_fits, motions, known_fits[:, 0] - np.nan_to_num(left[:, 0]))
+        common = np.where(np.isfinite(left[:, 0]), fits[:, 0] - left[:, 0], theta)
+        known_fits = np.where(np.isfinite(fits), fits, theta)
+        left = fits - _expected_by_others(known_fits, motions, common)
         whole = further_covariance(left[:, :1], m) + np.diag((MODEL_ERROR_SHARE * theta) ** 2)
         like = _motion_fits(known_fits[:, 0], motions[:, 0], to_tuples(whole))
     halves = further_covariance(left[:, 1:], m)

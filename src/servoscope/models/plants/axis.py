@@ -115,8 +115,6 @@ class AxisPlant(TermPlant):
     """
 
     translations: ClassVar[Mapping[str, Mapping[str, str]]] = read_translations(__file__)
-    fits_stretches: ClassVar[bool] = True
-    repeats_with_motion: ClassVar[bool] = True
     # friction carries the load too, and drives are no ideal source of force
     ray_angles: ClassVar[Mapping[str, float]] = dict.fromkeys((*FAULTS, *PAYLOAD_FAULTS), 0.2)
 

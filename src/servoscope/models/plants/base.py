@@ -102,8 +102,6 @@ class Plant(BaseModel, abc.ABC):
     size_errors: ClassVar[Mapping[str, float]] = {}
     # whether names come from coefficients fitted to all samples since the onset, by how such fits scatter when healthy
     fits_stretches: ClassVar[bool] = False
-    # whether what no term explains repeats with the motion, so that such fits are compared by it
-    repeats_with_motion: ClassVar[bool] = False
 
     kind: str  # name of the plant in a loop file
     # factor on u as recorded, before anything else is done with it, for example a torque constant
