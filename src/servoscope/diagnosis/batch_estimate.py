@@ -122,10 +122,11 @@ def isolation_inputs(exam: Examination, onset: Onset, at: int) -> tuple[list[Sig
 def _surest_fit(exam: Examination, onset: Onset, last: int) -> StretchFit | None:
     """Return a fit to the rows from an onset to the last one, or to all rows where that is surer; None: neither.
 
-    Where the recursion raised no alarm, the change may have been there from the first sample on.
+    Fits that are compared by motion serve where the recursion raised no alarm: the change may have been there from the
+    first sample on.
     """
     recording, model = exam.recording, exam.baseline.residual
-    if model is None:
+    if model is None or (model.like is not None and exam.recursion_alarm.any()):
         return None
     begin = onset.sample
     if last - begin < exam.pipeline.memory_samples:  # such an onset is hardly known: all of its interval counts
@@ -134,7 +135,7 @@ def _surest_fit(exam: Examination, onset: Onset, last: int) -> StretchFit | None
     fit, whole = model.deviation_of_rows(exam.pipeline, recording, rows, theta, exam.along), exam.whole_fit
     if fit is None or not np.isfinite(fit.deviation).all():
         fit = None
-    if model.like is None or whole is None or not np.isfinite(whole.deviation).all() or exam.recursion_alarm.any():
+    if model.like is None or whole is None or not np.isfinite(whole.deviation).all():
         return fit
     if fit is not None and fit.t2 > MIN_ONSET_GAIN * whole.t2:
         return fit

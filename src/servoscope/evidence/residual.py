@@ -33,7 +33,6 @@ MIN_RECORDINGS = 6  # so that five judge each: fewer do not tell a drift from sc
 MAX_FOLDS = 8  # of recordings that are left out, some together where there are more
 TOP_SPEED_QUANTILE = 0.99  # of the speed of a recording
 MOTION_MARGIN = 1.5  # of the limit of fits that are compared by motion: gains that nobody learned change them, too
-MODEL_ERROR_SHARE = 0.05  # of coefficients, by which few recordings of one load do not show that terms are off
 SHIFT_MARGIN = 2.0  # of the limit: differences of halves scatter with heavier tails than features
 ACCELERATION_QUANTILES = (1.0 / 3.0, 2.0 / 3.0)  # braking, neither, accelerating
 
@@ -104,7 +103,9 @@ def _learn_fits(
         common = np.where(np.isfinite(left[:, 0]), fits[:, 0] - left[:, 0], theta)
         known_fits = np.where(np.isfinite(fits), fits, theta)
         left = fits - _expected_by_others(known_fits, motions, common)
-        whole = further_covariance(left[:, :1], m) + np.diag((MODEL_ERROR_SHARE * theta) ** 2)
+        # recordings of one load do not show that terms are off: under another one by as much as they leave of u
+        unexplained = np.mean([1.0 - np.corrcoef(g.eta[g.ok], g.phi[g.ok] @ theta)[0, 1] ** 2 for g in regressions])
+        whole = further_covariance(left[:, :1], m) + np.diag(unexplained * theta**2)
         like = _motion_fits(known_fits[:, 0], motions[:, 0], to_tuples(whole))
     halves = further_covariance(left[:, 1:], m)
     margin = MOTION_MARGIN if like is not None else 1.0

@@ -115,9 +115,6 @@ class AxisPlant(TermPlant):
     """
 
     translations: ClassVar[Mapping[str, Mapping[str, str]]] = read_translations(__file__)
-    # friction carries the load too, and drives are no ideal source of force
-    ray_angles: ClassVar[Mapping[str, float]] = dict.fromkeys((*FAULTS, *PAYLOAD_FAULTS), 0.2)
-
     kind: Literal["axis"] = "axis"
     terms: Annotated[tuple[TermName, ...], TERM_TUPLE, UNIQUE_TERMS] = ("viscous", "coulomb", "offset")
     # speed [output per s] at which the term ``stribeck`` has fallen to a half
@@ -216,6 +213,11 @@ class AxisPlant(TermPlant):
             for parameter, (name, words, checks) in told.items()
             if parameter in known
         )
+
+    @property
+    def ray_angles(self) -> Mapping[str, float]:  # type: ignore[override]
+        """Of a payload whose mass gives the scale of u: friction carries it, too, and u is no exact force."""
+        return {} if self.payload_mass is None else {"moved_mass": 0.2}
 
     @property
     def rays(self) -> tuple[FaultRay, ...]:
