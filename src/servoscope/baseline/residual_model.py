@@ -218,11 +218,12 @@ class ResidualModel(BaselineModel):
         apart = np.abs(np.array(self.motions) - residual.motion).max(axis=1).min()
         if not apart <= np.log(SAME_MOTION_RATIO) or not is_near(np.array(self.groups[0].covariates), c):
             return np.full(2, np.nan)
+        if self.like is not None:  # an axis is scanned for changes, and what its terms leave of u goes by the gain
+            return np.zeros(2)
         share = residual.samples / self.samples
         moved = residual.shift - _expected_shift(whole, residual)
         scores = whole.score(residual.features[0], 2.0 * share, c), shift.score(moved, share)
-        # an axis is scanned for changes within a recording, and what its terms leave of u goes by the gain
-        return np.array(scores) / self.limits if self.like is None else np.zeros(2)
+        return np.array(scores) / self.limits
 
     def stretch_covariance(self, samples: float) -> FloatArray:
         """Return the covariance (n, n) of coefficients fitted to so many usable samples of a healthy recording.

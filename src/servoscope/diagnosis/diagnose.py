@@ -56,6 +56,7 @@ from servoscope.evidence.signals import find_signal_defect
 from servoscope.isolation.candidate import UNKNOWN, Candidate
 from servoscope.isolation.isolate import isolate
 from servoscope.isolation.ml import RefitResult, find_outside_onset
+from servoscope.models.plants.axis import AxisPlant
 from servoscope.signals import MIN_SAMPLES, Recording
 from servoscope.signals.readers import as_recording
 from servoscope.signals.readers.frames import Source
@@ -308,7 +309,8 @@ def _explain_alarm(
             onset = ml_refit.refit_onset(refined, exam, outside)
         doubts = ml_refit.disagreement_warnings(exam, candidates, refit, MIN_CERTAINTY)
     elif (axis := exam.baseline.axis) is not None:
-        plant = exam.baseline.plant.model_copy(update={"coefficients": axis.coefficients})
+        assert isinstance(exam.baseline.loop.plant, AxisPlant)
+        plant = axis.plant(exam.baseline.loop.plant)
         candidates = tuple(candidate.weighed(plant) for candidate in candidates)
     best, t = candidates[0], exam.recording.t
     doubts += (implausible := implausible_warnings(exam, best))

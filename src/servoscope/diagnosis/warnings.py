@@ -47,8 +47,8 @@ def detectable_sizes(exam: Examination) -> dict[str, tuple[float, float]]:
     }
     model, fit = baseline.residual, exam.whole_fit
     judged = [] if exam.pressures is None else [exam.pressures.model.detectable_changes]
-    if model is not None and fit is not None and np.isfinite(fit[0]).all() and np.isfinite(exam.residual_ratios).all():
-        judged.append(model.detectable_changes(baseline.fault_directions, fit[1]))
+    if model is not None and fit is not None and np.isfinite([*fit.deviation, *exam.residual_ratios]).all():
+        judged.append(model.detectable_changes(baseline.fault_directions, fit.covariance))
     for sizes in judged:
         smallest = {name: min(size, sizes.get(name, np.inf)) for name, size in smallest.items()}
     if exam.along is not None and exam.along.std is not None:
