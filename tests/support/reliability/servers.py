@@ -98,12 +98,15 @@ class Postgres:
         assert done.returncode == 0, f"{program}: {done.stdout}{done.stderr}"
 
 
-def mosquitto() -> Path | None:
-    """Return the broker's program, which Debian keeps off the path of most users; None where there is none."""
-    found = shutil.which(
-        "mosquitto", path=os.pathsep.join([os.environ.get("PATH", ""), str(Path(os.sep, "usr", "sbin"))])
-    )
+def server_program(name: str) -> Path | None:
+    """Return a program that Debian keeps off the path of most users; None where there is none."""
+    found = shutil.which(name, path=os.pathsep.join([os.environ.get("PATH", ""), str(Path(os.sep, "usr", "sbin"))]))
     return Path(found) if found else None
+
+
+def mosquitto() -> Path | None:
+    """Return the broker's program; None where there is none."""
+    return server_program("mosquitto")
 
 
 class Mosquitto:
