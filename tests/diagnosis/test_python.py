@@ -83,20 +83,6 @@ def test_paths_stand_where_objects_do_and_what_comes_is_short(tmp_path: Path) ->
     (axes,) = ss.plot(diagnosis)
     assert len(axes.get_yticks()) == len(baseline.names)
     plt.close("all")
-    # plotly gets the same numbers
-    drawn = ss.plot(baseline, backend="plotly")
-    bands, lines = drawn.data[::2], drawn.data[1::2]
-    np.testing.assert_allclose(lines[0].y, np.abs(H), rtol=1e-6)
-    upper_edge = np.asarray(bands[1].y)[len(H) :][::-1]
-    assert drawn.layout.yaxis.type == "log" and (upper_edge > lines[1].y).all()
-    assert [len(ss.plot(one, backend="plotly").data) for one in (recording, trace, inspection, diagnosis)] == [
-        3,
-        4,
-        2,
-        1,
-    ]
-    with pytest.raises(ValueError, match="not 'gnuplot'"):
-        ss.plot(baseline, backend="gnuplot")  # type: ignore[call-overload]
     with pytest.raises(TypeError, match=r"a plot is made of a Recording, .* not of int"):
         ss.plot(3)  # type: ignore[arg-type]
     judged = ss.write_report(tmp_path / "page.html", tmp_path / "baseline.json", path)

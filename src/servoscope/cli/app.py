@@ -41,7 +41,7 @@ GROUPS = {
         "fleet",
     ),
     "Before deployment, and in the drive": ("simulate", "design", "export"),
-    "Check servoscope itself": ("reproduce", "bench"),
+    "Check servoscope itself": ("reproduce",),
 }
 
 app = typer.Typer(

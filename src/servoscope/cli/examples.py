@@ -40,5 +40,4 @@ EXAMPLES = {
     "design": "servoscope design loop.toml monday.csv",
     "export": "servoscope export baseline.json --c monitor",
     "reproduce": "servoscope reproduce -o paper",
-    "bench": "servoscope bench",
 }

@@ -318,7 +318,7 @@ class Diagnosis(ShortRepr, ResultModel):
         """Return the same as a table for notebooks, with a picture."""
         return str(function_above("report.diagnosis_page", "render_diagnosis_cell")(self))
 
-    def plot(self, backend: Literal["matplotlib", "plotly"] = "matplotlib") -> Any:
+    def plot(self) -> Any:
         """Draw the coefficients over their healthy values, as `servoscope.plot` does.
 
         Examples
@@ -327,7 +327,7 @@ class Diagnosis(ShortRepr, ResultModel):
         >>> axes.get_title()
         'friday.csv: fault'
         """
-        return function_above("report.plots", "plot")(self, backend)
+        return function_above("report.plots", "plot")(self)
 
     def report(self, path: str | Path) -> None:
         """Write the report on it as one HTML page, as `servoscope.write_report` does.

@@ -1,11 +1,8 @@
-"""`servoscope bench`, and the benchmark of the chain: small runs find all figures, and peers agree."""
+"""The benchmark of the chain: a small run finds all figures, and peers agree."""
 
 from __future__ import annotations
 
-import json
-
 import pytest
-from commands import run
 from speed import chain
 from tools.timing import JobTiming, time_interleaved
 
@@ -44,16 +41,6 @@ FACTS = (
 )
 
 
-def test_the_command_says_what_a_sample_takes() -> None:
-    done = run("bench", "--repeats", 1, "--share", 0.01, "--json")
-    assert done.code == 0, done.err
-    ns = json.loads(done.out)["ns_per_sample"]
-    fleets = [f"fleet of 100, {precision}" for precision in ("double", "single")]
-    assert list(ns) == ["one log", "one sample at a time", *fleets]
-    assert all(time > 0.0 for time in ns.values())
-    assert "million/s" in run("bench", "--repeats", 1, "--share", 0.01).out
-
-
 @pytest.mark.slow
 def test_a_small_run_of_the_chain_finds_every_figure_and_peers_that_agree() -> None:
     result = chain.run_benchmarks(1, share=0.01)
@@ -71,15 +58,6 @@ def test_a_small_run_of_the_chain_finds_every_figure_and_peers_that_agree() -> N
     assert {name for name, figure in figures.items() if figure.error is not None} >= {*FIGURES[-3:], FIGURES[1]}
     assert all(number >= 0.0 for number in result.facts.values())
     assert len(result.table().rows) == len(figures)
-
-
-@pytest.mark.parametrize(
-    ("option", "value", "why"),
-    [("repeats", "0", "1"), ("repeats", "often", "integer"), ("share", "0", "0.001"), ("share", "1.5", "1")],
-)
-def test_what_makes_no_sense_is_refused(option: str, value: str, why: str) -> None:
-    done = run("bench", f"--{option}", value)
-    assert done.code == 2 and f"'--{option}'" in done.err and why in done.err
 
 
 def test_jobs_take_turns() -> None:
