@@ -111,3 +111,26 @@ def test_a_busy_worker_ends_with_its_parent(tmp_path: Path) -> None:
             return
         time.sleep(0.05)
     pytest.fail("the worker outlives its parent")
+
+
+def test_temporary_folders_go_with_a_process_that_is_killed() -> None:
+    program = """
+import time
+from servoscope.core.temporary import temporary_folder
+from servoscope.core.workers import Workers
+folder = temporary_folder("read")
+Workers().run("builtins:str")
+print(folder.name, flush=True)
+time.sleep(600)
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, env=ENVIRONMENT
+    ) as parent:
+        assert parent.stdout is not None
+        folder = Path(parent.stdout.readline().strip())
+        assert folder.is_dir()
+        parent.kill()
+    deadline = time.monotonic() + 60.0
+    while folder.parent.exists():
+        assert time.monotonic() < deadline, "the folder is still there"
+        time.sleep(0.05)

@@ -88,6 +88,22 @@ def urdf(**swaps: str) -> str:
             + "</robot>",
             "hangs on two joints",
         ),
+        *(
+            (urdf(mass=f'<mass value="{value}"/>'), rf"'{value}' is not 1 finite number")
+            for value in ("nan", "inf", "1e999", "", "0,6")
+        ),
+        (URDF.read_text(encoding="utf-8").replace('lower="-3.1"', 'lower="nan"', 1), "'nan' is not 1 finite number"),
+        (URDF.read_text(encoding="utf-8").replace('ixx="', 'ixx="-inf', 1), "is not 1 finite number"),
+        (
+            urdf(
+                root='<robot><link name="a"/><link name="b"/>'
+                + "".join(
+                    f'<joint name="{one}{other}" type="fixed"><parent link="{one}"/><child link="{other}"/></joint>'
+                    for one, other in ("ab", "ba")
+                )
+            ).replace(' name="six_joints">', "", 1),
+            "link 'a' is carried in a circle",
+        ),
     ],
 )
 def test_what_is_no_serial_arm_is_refused_in_one_line(text: str, words: str) -> None:

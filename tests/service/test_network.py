@@ -115,6 +115,7 @@ def attempt(url: str, folder: Path = Path(), **more: Any) -> tuple[bool, str]:
         *(("64:ff9b::10.1.2.3", False), ("64:ff9b:1::7f00:1", False), ("64:ff9b:1:7f00:0:100::", False)),  # NAT64
         *(("2002:7f00:1::", False), ("2002:a01:203::1", False)),  # 6to4
         *(("2001::7f00:1", False), ("2001:0:4136:e378:8000:63bf:80ff:fffe", False)),  # Teredo
+        *(("192.88.99.1", False), ("192.88.98.1", True), ("3fff::1", False), ("3fff:1000::1", True)),
         *(("192.168.7.7", True), ("::ffff:192.168.7.7", True), ("192.168.7.8", False)),  # the exception
     ],
 )

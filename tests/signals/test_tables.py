@@ -69,6 +69,16 @@ def test_comments_do_not_matter(tmp_path: Path) -> None:
     as_expected(read(written(tmp_path, ["# rig 7", "% 100 Hz, after service", *rows[:50], "# pause", *rows[50:]])))
 
 
+@pytest.mark.parametrize("line", ["# " + "x" * 1000, "key {}," + "x" * 1000])
+def test_much_text_above_the_table_does_not_matter(tmp_path: Path, line: str) -> None:
+    as_expected(read(written(tmp_path, [*map(line.format, range(100)), *lines()])))
+    as_expected(read(written(tmp_path, [*(line.format(k)[:9] for k in range(500)), *lines()])))
+
+
+def test_a_line_without_an_end_is_refused(tmp_path: Path) -> None:
+    assert "first line is longer than 4 MB" in refusal(written(tmp_path, [",".join(2**20 * ["abcd"]), *lines()]))
+
+
 def test_windows_line_ends_and_blank_lines_do_not_matter(tmp_path: Path) -> None:
     path = tmp_path / "x.csv"
     path.write_bytes(("\r\n".join(["", *lines(), "", ""])).encode())

@@ -13,8 +13,9 @@ IpAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
 # IPv6 whose last four bytes are the address of IPv4 that is meant: mapped (RFC 4291), and NAT64 (RFC 6052)
 CARRIERS = tuple(map(ipaddress.IPv6Network, ("::ffff:0:0/96", "64:ff9b::/96")))
 GLOBAL_UNICAST = ipaddress.IPv6Network("2000::/3")  # all that IANA has assigned to the internet
-# Tunnels inside it, which lead to any address of IPv4: Teredo (RFC 4380) and 6to4 (RFC 3056)
-TUNNELS = tuple(map(ipaddress.IPv6Network, ("2001::/32", "2002::/16")))
+# What is no host of the internet, though an older Python calls it global: tunnels, which lead to any address of IPv4,
+# Teredo (RFC 4380), 6to4 (RFC 3056) and its relays (RFC 3068); and documentation (RFC 9637)
+NO_HOSTS = tuple(map(ipaddress.ip_network, ("2001::/32", "2002::/16", "192.88.99.0/24", "3fff::/20")))
 
 
 def check_network(value: str) -> str:
@@ -56,5 +57,6 @@ def is_internal(host: str) -> bool:
     address = parse_ip(host)
     if address is None or not address.is_global or address.is_multicast:
         return True
-    in_tunnel = any(address in network for network in TUNNELS)
-    return address.version == 6 and (address not in GLOBAL_UNICAST or in_tunnel)
+    if any(address in network for network in NO_HOSTS):
+        return True
+    return address.version == 6 and address not in GLOBAL_UNICAST

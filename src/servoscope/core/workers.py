@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -32,11 +33,12 @@ from typing import Any, TypeVar
 from servoscope.core.cache_folders import replace_library_warnings
 from servoscope.core.errors import ServoscopeError
 from servoscope.core.sandbox import Sandbox
+from servoscope.core.temporary import process_folder
 
 Progress = Callable[[str], None]
 Task = TypeVar("Task")
 
-WORKER_CODE = "from servoscope.core.workers import worker_main; worker_main()"
+WORKER_CODE = "import sys; from servoscope.core.workers import worker_main; worker_main(sys.argv[1])"
 START_S = 60.0  # that a process and its libraries may take to start, on a machine that is busy
 SIGNAL_CODE = 128  # plus the number of the signal that ended a task's process: exit code of the one that forked it
 TASKS_PER_PROCESS = 2  # tasks handed out per process: enough to keep it busy
@@ -185,7 +187,7 @@ class _TaskProcess:
         ours, theirs = socket.socketpair()
         with theirs:
             self.process = subprocess.Popen(
-                [sys.executable, "-c", WORKER_CODE],
+                [sys.executable, "-c", WORKER_CODE, process_folder()],
                 stdin=theirs.fileno(),
                 cwd=folder,
                 env=environment,
@@ -252,8 +254,11 @@ class _TaskProcess:
         return f"it took its process down ({code}){need}"
 
 
-def worker_main() -> None:
-    """Fork a process for each sandbox that comes from stdin, until that is closed; what a worker executes."""
+def worker_main(temporary: str) -> None:
+    """Fork a process for each sandbox that comes from stdin, until that is closed; what a worker executes.
+
+    `temporary`: the folder of its parent, which is removed when that has ended.
+    """
     os.nice(NICENESS)
     replace_library_warnings()
     parent = Connection(os.dup(sys.stdin.fileno()))
@@ -264,7 +269,7 @@ def worker_main() -> None:
         try:
             libraries, limits, sandbox = parent.recv()
         except (EOFError, OSError, UnpicklingError):  # the last: the parent was killed in the middle of a task
-            return
+            return shutil.rmtree(temporary, ignore_errors=True)
         for library in libraries:
             with suppress(ImportError):  # a task says what is missing
                 importlib.import_module(library)

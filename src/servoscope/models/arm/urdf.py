@@ -90,9 +90,11 @@ class _Tree:
             raise ValueError(f"has {len(self.bases)} links that no joint carries, exactly one must be the base")
         chain: list[tuple[ET.Element, int, FloatArray, FloatArray]] = []
         inertial: list[FloatArray] = []
+        apart = dict.fromkeys(self.links)
         waiting = [(self.bases[0], -1, np.eye(3), np.zeros(3))]
         while waiting:
             link, moving, R, p = waiting.pop()
+            del apart[link]
             if moving >= 0:
                 inertial[moving] += _inertial(self.links[link], R, p)
             for joint in reversed(self.joints.get(link, [])):
@@ -108,12 +110,18 @@ class _Tree:
                 else:
                     kind = joint.get("type")
                     raise ValueError(f"joint {_name(joint)!r}: joints of type {kind!r} are not supported")
+        if apart:
+            raise ValueError(
+                f"link {next(iter(apart))!r} is carried in a circle of joints, none of which is on the base"
+            )
         if not chain:
             raise ValueError("has no moving joint")
         names = tuple(_name(joint) for joint, *_ in chain)
         for name, parameters in zip(names, inertial, strict=True):
             if parameters[0] <= 0.0:
                 raise ValueError(f"the link behind joint {name!r} has no inertia: add <inertial> with its mass")
+            if not np.isfinite(parameters).all():
+                raise ValueError(f"the inertia behind joint {name!r} is too large to count with: give SI units")
         return Kinematics(
             names,
             tuple(moving for _, moving, *_ in chain),
@@ -141,9 +149,12 @@ def _child(joint: ET.Element, key: str) -> ET.Element:
 
 
 def _numbers(text: str, count: int) -> FloatArray:
-    numbers = np.array([float(part) for part in text.split()])
+    try:
+        numbers = np.array([float(part) for part in text.split()])
+    except ValueError:
+        numbers = np.zeros(0)
     if numbers.shape != (count,) or not np.isfinite(numbers).all():
-        raise ValueError(f"{text!r} is not {count} numbers")
+        raise ValueError(f"{text[:60]!r} is not {count} finite number{'s' * (count > 1)}")
     return numbers
 
 
@@ -173,7 +184,9 @@ def _limits(joint: ET.Element) -> tuple[float, float]:
     limit = joint.find("limit")
     if limit is None or joint.get("type") == "continuous":
         return -np.inf, np.inf
-    return float(limit.get("lower", "-inf")), float(limit.get("upper", "inf"))
+    ends = (limit.get("lower"), -np.inf), (limit.get("upper"), np.inf)
+    lowest, highest = (unlimited if text is None else float(_numbers(text, 1)[0]) for text, unlimited in ends)
+    return lowest, highest
 
 
 def _inertial(link: ET.Element, R: FloatArray, p: FloatArray) -> FloatArray:
@@ -181,22 +194,22 @@ def _inertial(link: ET.Element, R: FloatArray, p: FloatArray) -> FloatArray:
     element = link.find("inertial")
     if element is None:
         return np.zeros(10)
-    mass = float(_child_value(element, "mass", "value"))
+    mass = _child_number(element, "mass", "value")
     R_own, p_own = _pose(element.find("origin"))
     R, c = R @ R_own, p + R @ p_own
     xx, xy, xz, yy, yz, zz = (
-        float(_child_value(element, "inertia", key)) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        _child_number(element, "inertia", key) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     )
     about_centre = R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
     return np.concatenate([[mass], mass * c, inertia_about(about_centre, mass, c)])
 
 
-def _child_value(element: ET.Element, tag: str, key: str) -> str:
+def _child_number(element: ET.Element, tag: str, key: str) -> float:
     child = element.find(tag)
     value = child.get(key) if child is not None else None
     if value is None:
         raise ValueError(f"an <inertial> has no {tag} {key}")
-    return value
+    return float(_numbers(value, 1)[0])
 
 
 def inertia_about(about_centre: FloatArray, mass: float, c: Sequence[float] | FloatArray) -> FloatArray:

@@ -6,7 +6,6 @@ import functools
 import gzip
 import lzma
 import re
-import tempfile
 import weakref
 import zipfile
 import zlib
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import IO, TypeVar
 
 from servoscope.core.errors import RecordingError
+from servoscope.core.temporary import temporary_folder
 from servoscope.signals.readers.addresses import is_address
 from servoscope.signals.readers.table import Table, TableFile, shorten_error
 
@@ -101,7 +101,7 @@ def unpack(path: Path, open_plain: Callable[[Path], TableFile]) -> TableFile:
     place = archive_of(path)
     assert place is not None, "the caller has asked"
     archive, member = place
-    folder = tempfile.TemporaryDirectory(prefix="servoscope-unpacked-")
+    folder = temporary_folder("unpacked")
     try:
         if archive.suffix.lower() == GZIP:
             inside = Path(folder.name) / (archive.stem or "log.csv")

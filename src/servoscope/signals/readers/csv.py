@@ -16,9 +16,9 @@ from servoscope.signals.readers.table import NULL_TEXTS, Table, TableFile, is_nu
 
 COMMENTS = ("#", "%", "//")
 DELIMITERS = (";", "\t", ",", "|", " ")
-HEAD_BYTES = 1 << 16  # that tell the layout
+HEAD_BYTES = 1 << 16  # that tell the layout, where the table begins in them
 MIN_HEAD_LINES = 8  # a file of thousands of columns has fewer in so many bytes
-MAX_LINE_BYTES = 1 << 22
+MAX_HEAD_BYTES = 1 << 22  # that are looked at otherwise: of long lines, or of many above the table
 LINE_ENDS = ";%"  # that stand behind each row in files of some programs
 CHUNK_BYTES = 1 << 23  # bytes that are read at a time
 SINGLE_BLOCK_BYTES = 1 << 20  # bytes that Arrow parses as one block anyway
@@ -52,30 +52,37 @@ class CsvLayout:
 def open_csv(path: Path, text: TextLayout | None = None) -> TableFile:
     """Open a text file, once its layout is known; `text`: what the user says of it."""
     with path.open("rb") as file:
-        head = file.read(HEAD_BYTES)
-        while head.count(b"\n") < MIN_HEAD_LINES and len(head) < MAX_LINE_BYTES and (chunk := file.read(len(head))):
-            head += chunk
-        layout = detect_layout(path, head, text or TextLayout(), cut=bool(file.read(1)))
+        head, rows = file.read(HEAD_BYTES), HEAD_ROWS
+        while (layout := detect_layout(path, head, rows, text or TextLayout(), cut=bool(file.peek(1)))) is None:
+            head += file.read(len(head))
+            rows *= 2
     return TableFile(path, layout.columns, lambda *wanted: read_csv(path, layout, *wanted))
 
 
-def detect_layout(path: Path, head: bytes, text: TextLayout, cut: bool = False) -> CsvLayout:
-    """Find out how a text file is laid out from its first bytes; `cut`: it has more.
+def detect_layout(path: Path, head: bytes, most: int, text: TextLayout, cut: bool) -> CsvLayout | None:
+    """Find out how a text file is laid out from its first bytes, and `most` lines of them; `cut`: it has more.
 
-    Raises RecordingError if it is not a table.
+    None: no table begins there, and it has more. Raises RecordingError if it is not a table.
     """
     encoding = _detect_encoding(head)
     lines = head.decode(encoding, errors="replace").splitlines()
-    if cut:
-        lines = lines[:-1] or lines
-    lines = lines[:HEAD_ROWS]
+    if cut and len(lines) < 2 and len(head) >= MAX_HEAD_BYTES:
+        raise RecordingError(f"{path}: its first line is longer than {len(head) / 1e6:.0f} MB, is it a table?")
+    has_more = (cut or len(lines) > most) and len(head) < MAX_HEAD_BYTES
+    lines = lines[: len(lines) - cut][:most]
+    if has_more and len(lines) < MIN_HEAD_LINES:
+        return None
     comments = (text.comment,) if text.comment else COMMENTS
     plain = ["" if line.lstrip().startswith(comments) else line for line in lines]
     plain[: text.skip_rows] = [""] * min(text.skip_rows, len(plain))
     if not any(line.strip() for line in plain):
+        if has_more:
+            return None
         raise EmptyRecordingError(f"{path}: holds comments only, no rows")
     header = None if text.header_row is None else text.header_row - 1
     if header is not None and not (header < len(plain) and lines[header].strip()):
+        if has_more and header >= len(plain):
+            return None
         raise RecordingError(f"{path}: --header-row {text.header_row}: there is no text in this line, name another")
     if header is not None:
         plain[header] = (
@@ -90,6 +97,8 @@ def detect_layout(path: Path, head: bytes, text: TextLayout, cut: bool = False) 
     rows = split[delimiter]
     table = find_table(rows, str(path), header)
     used = "" if delimiter == line_end else line_end
+    if table is None and has_more:
+        return None
     if table is None:  # no row of numbers: the first line says what the columns are, and what follows is told later
         delimiter = max(split, key=lambda candidate: len(next(filter(None, split[candidate]), [])))
         first, cells = next((i, row) for i, row in enumerate(split[delimiter]) if row)
@@ -279,7 +288,7 @@ def _split_cells(line: str, delimiter: str) -> list[str]:
         cells = line.split()
     else:
         try:
-            cells = next(csv.reader([line[:MAX_LINE_BYTES]], delimiter=delimiter, skipinitialspace=True), [])
+            cells = next(csv.reader([line[:MAX_HEAD_BYTES]], delimiter=delimiter, skipinitialspace=True), [])
         except csv.Error:
             cells = line.split(delimiter)
     return [cell.strip().strip("'\"") for cell in cells]

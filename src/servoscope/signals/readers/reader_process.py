@@ -8,11 +8,11 @@ import os
 import weakref
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from servoscope.core.errors import RecordingError
 from servoscope.core.sandbox import Sandbox
+from servoscope.core.temporary import temporary_folder
 from servoscope.core.workers import ProcessLimits, Progress, WorkerError, Workers
 from servoscope.signals.readers.table import TableFile
 
@@ -38,7 +38,7 @@ def open_bounded(path: Path, kind: str, module: str, function: str, library: str
     """
     timeout_s = BASE_S + path.stat().st_size / BYTES_PER_S
     place = (module, function, str(path.absolute()), str(path))
-    folder = TemporaryDirectory(prefix="servoscope-read-")
+    folder = temporary_folder("read")
     target = Path(folder.name) / "rows.arrow"
     sandbox = Sandbox(read=(place[2],), write=(folder.name,))
 

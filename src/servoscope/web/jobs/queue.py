@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from starlette.exceptions import HTTPException
@@ -18,6 +17,7 @@ from starlette.exceptions import HTTPException
 from servoscope.core.errors import ServoscopeError
 from servoscope.core.messages import SETTING, current_language, say
 from servoscope.core.sandbox import Sandbox
+from servoscope.core.temporary import temporary_folder
 from servoscope.core.workers import ProcessLimits, Progress, Workers
 from servoscope.web import errors
 from servoscope.web.schemas.responses import JobResponse, JsonObject
@@ -140,7 +140,7 @@ async def run_task(
     workers = Workers(limits, folder=folder, environment=_environment())
 
     def run() -> Any:
-        with TemporaryDirectory(prefix="servoscope-job-") as temporary:
+        with temporary_folder("job") as temporary:
             walls = replace(sandbox, write=(temporary, *sandbox.write))
             timeout_s = START_S + WALL_TIME_FACTOR * limits.cpu_s
             return workers.run(f"{TASKS}:{task}", *arguments, progress=progress, timeout_s=timeout_s, sandbox=walls)
