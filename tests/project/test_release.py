@@ -164,3 +164,33 @@ def test_the_bill_of_materials_has_every_package_with_its_hashes(project: Path) 
     known = {one["bom-ref"] for one in bill["components"]}
     assert set(bill["dependencies"][0]["dependsOn"]) == known and len(known) == len(found)
     assert sum("licenses" in one for one in bill["components"]) > 0.9 * len(found)
+
+
+def test_no_locked_package_has_a_known_hole_and_one_that_has_is_found(project: Path, tmp_path: Path) -> None:
+    def audit(*more: str) -> tuple[int, str]:
+        argv = [sys.executable, project / "scripts" / "audit.py", *more]
+        done = subprocess.run(argv, capture_output=True, text=True)
+        return done.returncode, done.stdout + done.stderr
+
+    assert audit()[0] == 0, audit()[1]
+    locks = {
+        "requirements.lock": "h11==0.15.0 \\\n    --hash=sha256:0\n",
+        "requirements-dev.lock": "a_b==2.0rc1\nc==1.0\n",
+    }
+    for name, text in locks.items():
+        (tmp_path / name).write_text(f"# locked\n{text}")
+    own = {"package": {"ecosystem": "PyPI", "name": "A.B"}, "versions": ["1.0"]}
+    ranged = own | {"ranges": [{"type": "ECOSYSTEM", "events": [{"introduced": "1.5"}, {"last_affected": "2.0"}]}]}
+    with zipfile.ZipFile(tmp_path / "all.zip", "w") as archive:
+        records = {"listed": [own], "ranged": [ranged], "other": [{"package": {"ecosystem": "npm", "name": "c"}}]}
+        for name, affected in records.items():
+            archive.writestr(f"{name}.json", json.dumps({"id": name, "summary": "a hole", "affected": affected}))
+        archive.writestr("gone.json", json.dumps({"id": "gone", "withdrawn": "2026-01-01", "affected": [ranged]}))
+    (tmp_path / "scripts").mkdir()
+    shutil.copy(project / "scripts" / "advisories.json", tmp_path / "scripts")
+    code, said = audit("--root", str(tmp_path))
+    assert code == 1 and said.startswith("h11 0.15.0: CVE-2025-43859: ") and "take 0.16.0\n3 packages" in said
+    code, said = audit("--root", str(tmp_path), "--renew", str(tmp_path / "all.zip"))
+    assert code == 1 and said.startswith(
+        "a-b 2.0rc1: ranged: a hole; there is no release without it\n3 packages, 2 advi"
+    )
