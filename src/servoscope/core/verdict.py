@@ -1,0 +1,115 @@
+"""The verdict on a recording: what every judge returns, the limit of their evidence, and the rule that decides.
+
+Evidence is a log Bayes factor against healthy [nats], or what is calibrated like one: ``-ln p`` of a statistic. Its
+limit follows from healthy recordings that were left out, with everything learned again. A further healthy recording is
+above n exchangeable ones with a probability of at most 1/(n + 1) (Vovk, Gammerman, Shafer, 2005); beyond, the model
+counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.messages import Message
+
+VerdictKind = Literal["healthy", "suspect", "fault", "undetermined"]
+
+FALSE_ALARMS = 0.01  # share of healthy recordings that may be called suspect
+SURE_LIMITS = 3.0  # limits from which one recording alone is a fault
+
+
+class Explanation(NamedTuple):
+    """A set of causes that explains a change; none: an unknown one."""
+
+    causes: tuple[str, ...]
+    log_odds: float  # against all others
+    sizes: FloatArray  # logarithms of the ratios of its parameters, shape (k,)
+    covariance: FloatArray  # of `sizes`, (k, k)
+    text: Message | None = None
+
+
+class Segment(NamedTuple):
+    """A part of a recording between two changes; times are lower end, most likely and upper end [s]."""
+
+    begin_s: tuple[float, float, float]
+    end_s: tuple[float, float, float]
+    changed: bool
+    deviation: FloatArray  # of the coefficients from healthy ones, shape (p,); of no element where there are none
+    covariance: FloatArray  # (p, p)
+    explanations: tuple[Explanation, ...] = ()  # the likeliest first
+
+
+class Evidence(NamedTuple):
+    """What one judge says of a recording."""
+
+    judge: str
+    nats: float  # against healthy
+    segments: tuple[Segment, ...] = ()  # in order; none: it speaks of the whole recording
+    inside: bool = False  # whether the recording changed within itself, which scatter between recordings does not do
+
+
+class Verdict(NamedTuple):
+    """What all judges together say of a recording."""
+
+    kind: VerdictKind
+    evidence: float  # against healthy [nats]
+    limit: float  # of the evidence
+    recordings: int = 0  # n that were left out behind the limit
+    segments: tuple[Segment, ...] = ()
+    inside: bool = False
+
+    @property
+    def excess(self) -> float:
+        """The evidence over its limit."""
+        return self.evidence / self.limit
+
+    @property
+    def guaranteed(self) -> float:
+        """Share of healthy recordings that look like this, whatever their distribution: at most 1/(n + 1)."""
+        return 1.0 / (self.recordings + 1.0)
+
+    @property
+    def by_model(self) -> float:
+        """Share of healthy recordings that look like this if the model holds beyond the recordings left out."""
+        learned = self.limit + float(np.log(FALSE_ALARMS))  # what left-out recordings have raised the limit by
+        return float(np.exp(-np.clip(self.evidence - max(learned, 0.0), 0.0, 700.0)))
+
+
+def evidence_limit(left_out: Sequence[float], false_alarms: float = FALSE_ALARMS) -> float:
+    """Return the limit of the evidence: ``max(ln 1/alpha, largest left out + ln 1/(alpha (n + 1)))`` [nats]."""
+    least = -float(np.log(false_alarms))
+    if not len(left_out):
+        return least
+    return max(least, max(left_out) - float(np.log(false_alarms * (len(left_out) + 1.0))))
+
+
+def joint_evidence(judges: Sequence[Evidence]) -> Evidence | None:
+    """Return the strongest evidence, less what it costs that the strongest of several judges is taken; None: no judge.
+
+    Each has its share of the false alarms (Bonferroni): at most so many times as often is one of them above a limit.
+    """
+    if not judges:
+        return None
+    strongest = max(judges, key=lambda evidence: evidence.nats)
+    return strongest._replace(nats=strongest.nats - float(np.log(len(judges))))
+
+
+def decide(
+    evidence: Evidence | None, limit: float, recordings: int = 0, before: VerdictKind = "undetermined"
+) -> Verdict:
+    """Return the verdict on a recording: suspect above the limit, and fault if that is sure.
+
+    It is sure with a change inside the recording, at `SURE_LIMITS` times the limit, and after another recording that
+    was above the limit (`before`: the verdict on the recording before).
+    """
+    if evidence is None:
+        return Verdict("undetermined", 0.0, limit, recordings)
+    kind: VerdictKind = "healthy"
+    if evidence.nats > limit:
+        sure = evidence.inside or evidence.nats > SURE_LIMITS * limit or before in ("suspect", "fault")
+        kind = "fault" if sure else "suspect"
+    return Verdict(kind, evidence.nats, limit, recordings, evidence.segments, evidence.inside)
