@@ -43,7 +43,7 @@ class Segment(NamedTuple):
     explanations: tuple[Explanation, ...] = ()  # the likeliest first
 
 
-class Evidence(NamedTuple):
+class JudgeEvidence(NamedTuple):
     """What one judge says of a recording."""
 
     judge: str
@@ -87,7 +87,7 @@ def evidence_limit(left_out: Sequence[float], false_alarms: float = FALSE_ALARMS
     return max(least, max(left_out) - float(np.log(false_alarms * (len(left_out) + 1.0))))
 
 
-def joint_evidence(judges: Sequence[Evidence]) -> Evidence | None:
+def joint_evidence(judges: Sequence[JudgeEvidence]) -> JudgeEvidence | None:
     """Return the strongest evidence, less what it costs that the strongest of several judges is taken; None: no judge.
 
     Each has its share of the false alarms (Bonferroni): at most so many times as often is one of them above a limit.
@@ -99,7 +99,7 @@ def joint_evidence(judges: Sequence[Evidence]) -> Evidence | None:
 
 
 def decide(
-    evidence: Evidence | None, limit: float, recordings: int = 0, before: VerdictKind = "undetermined"
+    evidence: JudgeEvidence | None, limit: float, recordings: int = 0, before: VerdictKind = "undetermined"
 ) -> Verdict:
     """Return the verdict on a recording: suspect above the limit, and fault if that is sure.
 
