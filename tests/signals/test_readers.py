@@ -44,9 +44,9 @@ def test_the_clock_may_be_missing_if_the_loop_knows_the_rate(tmp_path: Path, loo
     recording = read(path, loop)
     assert [defect.kind for defect in recording.defects] == ["clock"]
     np.testing.assert_allclose(recording.t, signals()["t"])
-    assert "give a loop" in refusal(path)
+    assert "--rate 200" in refusal(path)
     assert read(written(tmp_path, lines()), loop, columns=Columns(time=None)).defects[0].kind == "clock"
-    assert "give a loop" in refusal(path, columns=Columns(time=None))
+    assert "--rate 200" in refusal(path, columns=Columns(time=None))
 
 
 def test_a_clock_of_another_name_is_not_ignored(tmp_path: Path, loop: Loop) -> None:

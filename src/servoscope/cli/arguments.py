@@ -6,7 +6,7 @@ import math
 import re
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -128,12 +128,19 @@ def parse_mapping(text: str | None, base: Columns | None = None) -> Columns | No
         raise typer.BadParameter(f"--{error}; as in --columns 't=Time, r=Ref, u=2 * Current, y=Pos'") from None
 
 
+def _row_time(rate: float) -> str:
+    """Return what ``--rate`` means as the time column."""
+    if not 0.0 < rate < math.inf:
+        raise typer.BadParameter(f"--rate {rate:g}: give the rate of the rows in Hz, above 0")
+    return f"row/{rate:.12g}"
+
+
 UNBOUNDED = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True)
 class RecordingReader:
-    """How a command reads recordings: the loop, and what the options say."""
+    """How a command reads recordings: the loop, and what the options say; `changes`: of columns, whatever they are."""
 
     loop: Loop | None
     columns: Columns | None
@@ -141,7 +148,7 @@ class RecordingReader:
     by: str | None
     span: tuple[float, float]
     text: TextLayout | None = None
-    resample: bool = False
+    changes: dict[str, object] = field(default_factory=dict)
     axis: str | None = None
 
     @classmethod
@@ -160,6 +167,8 @@ class RecordingReader:
         changes: dict[str, object] = {"text": text} if text is not None else {}
         if reading.resample:
             changes |= {"resample": True}
+        if reading.rate is not None:
+            changes |= {"time": _row_time(reading.rate)}
         if changes and (mapping is not None or base is not None):
             mapping = (mapping or base or Columns()).model_copy(update=changes)
         span = reading.from_s, reading.to_s
@@ -167,7 +176,7 @@ class RecordingReader:
         if not start < end:
             raise typer.BadParameter(f"--from {start:g} must be before --to {end:g}")
         where = parse_conditions(reading.where or ())
-        return cls(loop, mapping, where, reading.by, (start, end), text, reading.resample, reading.axis)
+        return cls(loop, mapping, where, reading.by, (start, end), text, changes, reading.axis)
 
     def read(self, path: Path) -> list[Recording]:
         """Return the recordings in a file: one, or one per value of the column in ``--by``."""
@@ -179,11 +188,10 @@ class RecordingReader:
             from servoscope.learning.proposal import propose_columns
 
             columns = propose_columns(path, readers.list_channels(path, self.text), self.axis)
-        if columns is None and (self.text is not None or self.resample):  # nobody says where the signals stand
+        if columns is None and self.changes:  # nobody says where the signals stand
             columns = Columns()
         if columns is not None:
-            columns = columns.model_copy(update={"text": self.text or columns.text})
-            columns = columns.model_copy(update={"resample": self.resample or columns.resample})
+            columns = columns.model_copy(update=self.changes)
         parts = readers.read_parts(path, self.loop, columns=columns, where=self.where, by=self.by)
         if self.span == UNBOUNDED:
             return parts

@@ -131,6 +131,7 @@ def read_loops(path: Path, reader: arguments.RecordingReader) -> Iterator[tuple[
 
     given = reader.columns
     loops = {"": given} if given is not None else find_loops(open_source(path, reader.text).columns)
+    loops = {tag: columns.model_copy(update=reader.changes) for tag, columns in loops.items()}
     first, last = reader.span
     for name, tag, samples in read_tags(path, loops, reader):
         rows = samples if reader.span == arguments.UNBOUNDED else samples[(samples.t >= first) & (samples.t < last)]
@@ -146,7 +147,6 @@ def read_tags(
     plain = {tag: columns for tag, columns in loops.items() if not columns.segment}
     for tag, columns in loops.items():
         if columns.segment or len(plain) == 1:
-            columns = columns.model_copy(update={"text": reader.text or columns.text})
             for name, samples in read_rows(path, columns, reader.where, reader.by).items():
                 yield name, tag, samples
     if len(plain) > 1:
@@ -154,7 +154,7 @@ def read_tags(
             x for columns in plain.values() for x in (columns.reference, columns.input, str(columns.output)) if x
         }
         some = next(iter(plain.values()))
-        whole = some.model_copy(update={"text": reader.text or some.text, "covariates": {x: x for x in signals}})
+        whole = some.model_copy(update={"covariates": {x: x for x in signals}})
         for name, samples in read_rows(path, whole, reader.where, reader.by).items():
             channels = samples.channels
             for tag, columns in plain.items():

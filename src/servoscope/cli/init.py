@@ -59,7 +59,7 @@ def init(
         steps.begin(log.name)
         channels = readers.list_channels(log, reader.text)
     if asks and reading.columns is None:
-        results.print_channels(out, log, channels)
+        results.print_channels(out, log, channels, reading.rate)
     axes = [reading.axis] if reading.axis is not None or reading.columns is not None else []
     axes = axes or [*find_axes([channel.name for channel in channels])] or [None]
     targets = [_axis_file(output, axis) if len(axes) > 1 else output for axis in axes]
@@ -82,9 +82,8 @@ def init(
             if open_question and (chosen is None or not typer.confirm(say("init.confirm_columns"), default=True)):
                 chosen = propose_columns(log, channels, axis, typer.prompt(say("init.ask_columns")))
             assert chosen is not None, "it was proposed, or asked for"
-            changes = {"text": reader.text or chosen.text, "resample": reading.resample or chosen.resample}
             with read_part(PART_ROWS) as part:
-                _propose(out, logs, chosen.model_copy(update=changes), target, asks, reader.where)
+                _propose(out, logs, chosen.model_copy(update=reader.changes), target, asks, reader.where)
             cut = [say("init.part", log=name, rows=count) for name, count in part.cut.items()]
             results.print_notes(out, cut, "blue", "-")
     failures.exit_if_any()

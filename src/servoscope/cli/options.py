@@ -30,6 +30,9 @@ SkipOption = Annotated[
 CommentOption = Annotated[
     str | None, typer.Option(metavar="TEXT", help="Text files: what lines that hold no row begin with.")
 ]
+RateOption = Annotated[
+    float | None, typer.Option(metavar="HZ", help="Of a file without a time column: the rate at which its rows came.")
+]
 FromOption = Annotated[
     float | None, typer.Option("--from", metavar="S", help="Leave out what is before this time, in s.")
 ]
@@ -69,6 +72,7 @@ class ReadingOptions:
     header_row: HeaderRowOption = None
     skip: SkipOption = 0
     comment: CommentOption = None
+    rate: RateOption = None
     resample: ResampleOption = False
     from_s: FromOption = None
     to_s: ToOption = None

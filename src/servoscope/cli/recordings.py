@@ -63,7 +63,7 @@ def inspect(
                         if as_json:
                             print_json(plain_values.channels_summary(path.name, channels), lines=several)
                         else:
-                            results.print_channels(out, path, channels)
+                            results.print_channels(out, path, channels, reading.rate)
                     continue
                 for recording in reader.read(path):
                     steps.advance("inspecting")

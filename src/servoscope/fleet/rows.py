@@ -118,7 +118,7 @@ def required_columns(columns: Columns, known: Sequence[str], where: str) -> list
     Raises RecordingError, LoopError if one does not exist, or the mapping has no time: rows that are spread over
     files have no order without.
     """
-    if columns.time is None:
+    if columns.time is None or columns.row_rate is not None:
         raise RecordingError(f"{where}: rows of a fleet need a time column: say which it is, --columns 't=...'")
     named = [find_channel(columns.time, known, f"{where}: [columns] time")]
     for key in ("reference", "input"):

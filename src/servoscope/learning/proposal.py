@@ -128,8 +128,7 @@ def propose_columns(
             f"{path}: no name suggests {' and '.join(missing)}: say which columns they are,"
             f" {mapping_template(fields)}; the file has {shown}"
         )
-    default = Columns()
-    fields["reference"] = fields["reference"] or default.reference  # u stands for it where there is none
+    fields["reference"] = fields["reference"] or Columns().reference  # u stands for it where there is none
     try:
         return Columns.model_validate({"segment": (), **fields})
     except ValidationError as error:
@@ -357,13 +356,14 @@ def _unwrapped_columns(
 
 
 def _column_lines(path: Path, columns: Columns, wraps: Mapping[str, float], recording: Recording) -> list[ProposalLine]:
-    lines = []
+    lines = list[ProposalLine]()
     if columns.time is not None:
         told = message("init.time_unit"), False
         if _counts_seconds(columns, recording):  # a counter, or another unit, that nobody names
             told = message("init.time_counts", step=1.0 / recording.sample_rate), True
-        lines.append(ProposalLine("columns", "time", _quoted(columns.time), message("init.column")))
-        lines.append(ProposalLine("columns", "time_unit", _quoted(columns.time_unit), *told))
+        why = message("init.row_rate" if columns.row_rate else "init.column")
+        lines = [ProposalLine("columns", "time", _quoted(columns.time), why)]
+        lines += [ProposalLine("columns", "time_unit", _quoted(columns.time_unit), *told)] * (columns.row_rate is None)
     without = columns.reference == Columns().reference and columns.reference not in open_file(path, columns.text).known
     spans = [float(np.ptp(x[np.isfinite(x)])) for x in (recording.r, recording.y)]
     for key, texts in (("reference", (columns.reference,)), ("input", (columns.input,)), ("output", columns.outputs)):

@@ -9,13 +9,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, SerializeAsAny, ValidationError, field_validator, model_validator
+from pydantic import Field, SerializeAsAny, ValidationError, field_validator, model_validator
 
 from servoscope.core.errors import LoopError, ObsoleteSettingWarning
 from servoscope.core.settings import Finite, NonEmptyStr, NonNegative, Positive, Settings, parse_toml, read_toml_text
 from servoscope.core.settings_errors import describe_error
 from servoscope.core.short_repr import ShortRepr
 from servoscope.models import plants
+from servoscope.models.columns import Columns as Columns
+from servoscope.models.columns import TextLayout as TextLayout
 
 DEFAULT_FREQUENCIES = (1.0, 10.0, 20.0)
 FEATURE_FALSE_ALARMS = 0.005
@@ -26,59 +28,6 @@ MIN_DEFAULT_MEMORY = 50.0  # samples; a shorter memory hardly averages noise
 MIN_FREQUENCY_SHARE = 1e-6  # of the sample rate: a slower filter would take millions of samples to settle
 
 Interval = tuple[Finite, Finite]
-
-
-def _check_zone(value: str) -> str:
-    from zoneinfo import ZoneInfo
-
-    try:
-        ZoneInfo(value)
-    except (KeyError, ValueError, OSError):
-        raise ValueError(f"{value!r} is no zone of the IANA list, give one as Europe/Berlin") from None
-    return value
-
-
-TimeZone = Annotated[NonEmptyStr, AfterValidator(_check_zone)]  # its name, as Europe/Berlin
-
-
-class TextLayout(Settings):
-    """What cannot be found in a text file by itself: where its table begins."""
-
-    header_row: Annotated[int, Field(strict=True, ge=1)] | None = None  # line with the names of the columns, from 1
-    skip_rows: Annotated[int, Field(strict=True, ge=0)] = 0  # lines at the beginning that are not looked at
-    comment: NonEmptyStr | None = None  # what lines that hold no row begin with, in the place of #, % and //
-
-
-class Columns(Settings):
-    """Where the signals stand in a recording."""
-
-    time: NonEmptyStr | None = "t"  # column of the time stamps; None when there is none and the samples are uniform
-    # reference, input, output: columns of r, u, y, or linear combinations of columns, for example ``"set_point -
-    # position_error"``; where the command is u itself, the reference may be left out
-    reference: NonEmptyStr = "r"
-    input: NonEmptyStr = "u"
-    # of the output, several of the same quantity may be listed: y is their mean, and they are compared with each other
-    output: NonEmptyStr | Annotated[tuple[NonEmptyStr, ...], Field(min_length=2)] = "y"
-    # columns of what the healthy coefficients depend on, by its name, as ``oil_temperature = "T_oil"``
-    covariates: dict[NonEmptyStr, NonEmptyStr] = Field(default_factory=dict)
-    time_unit: Literal["s", "ms", "us", "ns", "min"] = "s"  # unit of a numeric time column
-    segment: tuple[NonEmptyStr, ...] = ()  # columns whose change starts a new run; a time reset does too
-    resample: bool = False  # whether rows are put on the loop's sample rate, where logs come irregularly or at another
-    # zone of dates and times that are written in local time, as Europe/Berlin; None: they count as they are written
-    time_zone: TimeZone | None = None
-    text: TextLayout | None = None  # of text files whose table is not found by itself
-
-    @field_validator("output")
-    @classmethod
-    def _different_sensors(cls, value: str | tuple[str, ...]) -> str | tuple[str, ...]:
-        if not isinstance(value, str) and len(set(value)) < len(value):
-            raise ValueError("names a channel twice, remove one")
-        return value
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """The channels whose mean is y, as a rule one."""
-        return (self.output,) if isinstance(self.output, str) else self.output
 
 
 class Controller(Settings):

@@ -62,9 +62,8 @@ def clean(
     if any(channel.ndim != 1 or channel.size != raw[0].size for channel in (*raw, *extra.values())):
         raise RecordingError(f"{name}: t, r, u and y must be columns of equal length")
     _check_channels(raw[1:], name, labels)
-    axis = build_time_axis(
-        raw[0], None if run is None else np.asarray(run), None if target else sample_rate, name, regular=target is None
-    )
+    marks, rate = None if run is None else np.asarray(run), None if target else sample_rate
+    axis = build_time_axis(raw[0], marks, rate, name, regular=target is None, signals=raw[1:])
     target = target and target.at(axis.sample_rate, axis.t)
     timebase, defects = Timebase(1.0 / axis.sample_rate), list(axis.defects)
     logged: list[npt.NDArray[Any]] = [axis.t, axis.run, *(axis.reorder(channel) for channel in raw[1:])]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from servoscope.core.arrays import FloatArray, IndexArray, Int32Array, select_ro
 from servoscope.core.errors import IrregularTimeError, RecordingError
 from servoscope.core.messages import message
 from servoscope.signals.defects import Defect, mask_spans
+from servoscope.signals.rounded_stamps import uniform_stamps
 from servoscope.signals.timebase import (
     GAP_STEP,
     MAX_TIME_S,
@@ -59,13 +61,19 @@ class TimeAxis(NamedTuple):
 
 
 def build_time_axis(
-    t: FloatArray, marks: npt.NDArray[Any] | None, sample_rate: float | None, name: str, regular: bool = True
+    t: FloatArray,
+    marks: npt.NDArray[Any] | None,
+    sample_rate: float | None,
+    name: str,
+    regular: bool = True,
+    signals: Sequence[FloatArray] = (),
 ) -> TimeAxis:
     """Sort the rows within their runs and lay the runs end to end where their times overlap.
 
     `t`: time stamps [s] as logged, shape (N,); `marks`: values, shape (N,), whose change starts a new run; None:
     there is one; `sample_rate`: expected [Hz]; None: as measured; `name`: what errors call the recording; `regular`:
-    whether steps have to be of one length, because nobody resamples them.
+    whether steps have to be of one length, because nobody resamples them; `signals`: columns (N,), which distinguish
+    rows of one stamp that were sampled one after the other from rows that were written twice.
 
     Raises RecordingError if the time axis runs backwards or in disorder, is too coarse or irregular, or the rate is not
     the expected one.
@@ -80,6 +88,8 @@ def build_time_axis(
         begins = outofcore.find_rows(lambda rows: np.asarray(marks[rows] != marks[previous_rows(rows)]), marks, first=1)
     t = outofcore.drop_rows(t, lost)
     begins = _shift_run_starts(begins, lost, t.size)
+    exact = uniform_stamps(t, begins, [outofcore.drop_rows(x, lost) for x in signals])
+    t = t if exact is None else exact
     period, backwards = _check_direction(t, begins, name)
     wild = outlier_rows(t, begins, backwards, period)
     if wild.size:
@@ -170,7 +180,7 @@ def _check_direction(t: FloatArray, begins: IndexArray, name: str) -> tuple[floa
     if repeated > MAX_REPEATED_SHARE * count:
         raise RecordingError(
             f"{name}: {repeated} of {count + 1} time stamps repeat the one before:"
-            " the clock is too coarse, log finer time stamps or leave the time column out"
+            " the clock is too coarse, log finer time stamps, or say at which rate the rows came, --rate HZ"
         )
     return _typical_step(_sample_steps(t, begins)), back
 

@@ -212,8 +212,11 @@ def _format_sources(b: Baseline) -> str:
     return f"{', '.join(source.name for source in b.sources)}, {length}"
 
 
-def print_channels(out: Console, path: Path, channels: Sequence[ChannelInfo]) -> None:
-    """Print the columns of a file, which of them might be t, r, u and y, and what to do next."""
+def print_channels(out: Console, path: Path, channels: Sequence[ChannelInfo], rate: float | None = None) -> None:
+    """Print the columns of a file, which of them might be t, r, u and y, and what to do next.
+
+    `rate`: that of the rows, where the user says it [Hz].
+    """
     from servoscope.signals.readers.axes import signal_names
     from servoscope.signals.readers.guess_columns import format_mapping, guess_mapping
 
@@ -227,7 +230,10 @@ def print_channels(out: Console, path: Path, channels: Sequence[ChannelInfo]) ->
     missing = [letter for letter, field in (("u", "input"), ("y", "output")) if fields[field] is None]
     if missing:
         print_notes(out, [say("cli.missing_mapping", names=missing)])
-    print_command(out, say("cli.next_init"), f"servoscope init {shlex.quote(str(path))}")
+    if fields["time"] is None and rate is None:
+        print_notes(out, [say("cli.missing_time")])
+    told = "" if rate is None and fields["time"] is not None else f" --rate {'HZ' if rate is None else f'{rate:.12g}'}"
+    print_command(out, say("cli.next_init"), f"servoscope init {shlex.quote(str(path))}{told}")
 
 
 def print_column_mapping(out: Console, columns: Columns) -> None:

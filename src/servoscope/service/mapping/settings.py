@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from servoscope.core.settings import Finite, NonEmptyStr, NonNegative, Positive, Settings
-from servoscope.models.loop import TimeZone
+from servoscope.models.columns import TimeZone
 from servoscope.service.config_types import Seconds, matching
 from servoscope.service.mapping.paths import ASSET, SIGNAL, RowPath, TextPattern
 

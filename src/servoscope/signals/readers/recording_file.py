@@ -29,6 +29,7 @@ from servoscope.signals.samples import Samples
 from servoscope.signals.time_axis import build_time_axis
 
 MIN_EPOCH_S, MAX_EPOCH_S = 3e8, 5e9  # a time stamp between them counts from 1970: from 1979 to 2128
+ROW_RATE_HINT = "say at which rate its rows came, --rate 200 for 200 Hz (t=row/200 in --columns)"
 TIME_NAMES = ("t", "time", "zeit", "timestamp", "time_s", "seconds", "datetime", "date", "elapsed")
 
 
@@ -215,7 +216,7 @@ def _read_rows(
     shown = {"r": columns.reference, "u": columns.input, "y": " and ".join(columns.outputs)}
     r, u, y = (letter if letter == text else f"{letter} ({text!r})" for letter, text in shown.items())
     carried = (*sensors, *columns.covariates, *of_plant)
-    options = clock is not None, carried, loop, (r, u, y), _resample_target(columns, loop)
+    options = clock is not None, columns.row_rate, carried, loop, (r, u, y), _resample_target(columns, loop)
     parts: dict[str, LoggedRows] = {}
     run = 0
     for table in opened.iter_chunks(wanted, texts):
@@ -273,13 +274,15 @@ class LoggedRows:
         self,
         name: str,
         timed: bool,
+        row_rate: float | None,
         channels: tuple[str, ...],
         loop: Loop | None,
         labels: tuple[str, str, str],
         target: ResampleTarget | None,
     ) -> None:
         self.name, self._has_time, self._channels = name, timed, channels
-        self._loop, self._labels, self._target = loop, labels, target if timed else None
+        self._loop, self._labels, self._row_rate = loop, labels, row_rate or (loop.sample_rate if loop else None)
+        self._target = target if timed or row_rate else None
         self._columns: list[GrowableArray] = []
         self._broken: list[tuple[int, float, int, str]] = []
         self._rows = 0
@@ -304,7 +307,7 @@ class LoggedRows:
         """Return t, r, u and y; the runs, if there are some; the channels."""
         columns = [column.to_array() for column in self._columns]
         if not self._has_time:
-            columns.insert(0, _uniform_time(self._rows, self._rate or 1.0))
+            columns.insert(0, _uniform_time(self._rows, self._row_rate or 1.0))
         covariates = dict(zip(self._channels, columns[len(columns) - len(self._channels) :], strict=True))
         signals, runs = columns[:4], columns[4 : len(columns) - len(self._channels)]
         return signals, runs[0] if runs else None, covariates
@@ -317,7 +320,7 @@ class LoggedRows:
         if self._target is not None:
             return self._clean(*self.split_columns())
         (t, *signals), run, channels = self.split_columns()
-        axis = build_time_axis(t, run, self._rate, self.name)
+        axis = build_time_axis(t, run, self._rate, self.name, signals=signals)
         r, u, y = map(axis.reorder, signals)
         others = {name: axis.reorder(channel) for name, channel in channels.items()}
         return Samples.from_columns(axis.t, r, u, y, np.diff(axis.run, prepend=0) > 0, others)
@@ -347,7 +350,7 @@ class LoggedRows:
             target=self._target,
         )
         if not self._has_time:
-            text = message("defect.no_time", rate=recording.sample_rate)
+            text = message("defect.no_time", rate=self._row_rate)
             notes.append(Defect("clock", float(recording.t[0]), float(recording.t[-1]), recording.samples, text))
         return with_defects(recording, *notes)
 
@@ -375,24 +378,21 @@ def _uniform_time(rows: int, rate: float) -> FloatArray:
 
 def _find_time_column(opened: TableFile, columns: Columns, loop: Loop | None) -> TimeColumn | None:
     """Return the time column; None where rows are uniform."""
+    if columns.row_rate is not None:
+        return None
     wanted, known = columns.time, opened.known
     where = f"{opened.name}: [columns] time"
+    # A clock under another name must not be thrown away for a uniform one.
+    clock = next((name for name in known if re.split(r"[\s\[(]", name.casefold())[0] in TIME_NAMES), None)
     if wanted is not None and wanted not in known and "+" in wanted:
         parts = [find_channel(part, known, where) for part in wanted.split("+")]
         return TimeColumn(parts, columns.time_unit, columns.time_zone)
     if wanted is not None and (wanted in known or wanted != Columns().time):
         return TimeColumn([find_channel(wanted, known, where)], columns.time_unit, columns.time_zone)
-    # A clock under another name must not be thrown away for a uniform one.
-    clock = next((name for name in known if re.split(r"[\s\[(]", name.casefold())[0] in TIME_NAMES), None)
-    if wanted is not None and (clock is not None or loop is None):
-        hint = (
-            f"is it {clock!r}? then say so in [columns] time"
-            if clock
-            else "give a loop, whose sample rate is taken then"
-        )
-        raise RecordingError(f"{opened.name}: [columns] time: no column {wanted!r}, {hint}")
+    if wanted is not None and clock is not None:
+        raise RecordingError(f"{where}: no column {wanted!r}, is it {clock!r}? then say so in [columns] time")
     if loop is None:
-        raise RecordingError(f"{opened.name}: has no time column, give a loop with its sample rate")
+        raise RecordingError(f"{opened.name}: has no time column: {ROW_RATE_HINT}")
     return None
 
 
