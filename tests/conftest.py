@@ -49,7 +49,6 @@ LONGEST = (
     "eha_cases",
     "web_pages",
     "estimators",
-    "web_oidc",
     "compatibility",
     "points",
     "store",

@@ -129,7 +129,7 @@ def test_every_key_of_the_loop_file_is_documented() -> None:
 
 
 def test_every_key_of_the_service_file_is_documented() -> None:
-    from servoscope.service.access.oidc import OidcSettings
+    from servoscope.service.access.sign_on import SignOnSettings
     from servoscope.service.config import ServiceFile
     from servoscope.service.kinds import PUBLISHERS, SOURCES, find_kinds
     from servoscope.service.mapping.settings import PayloadSettings
@@ -145,8 +145,8 @@ def test_every_key_of_the_service_file_is_documented() -> None:
             missing += [f"{key}: {name}" for name in inside if not has_line(text, name)]
     text = section("service-file.md", r"\[sources\.NAME\.payload\]") or ""
     missing += [f"payload: {name}" for name in PayloadSettings.model_fields if not has_line(text, name)]
-    text = section("service-file.md", r"\[web\.oidc\]") or ""
-    missing += [f"web.oidc: {name}" for name in OidcSettings.model_fields if not has_line(text, name)]
+    text = section("service-file.md", r"\[web\.sign_on\]") or ""
+    missing += [f"web.sign_on: {name}" for name in SignOnSettings.model_fields if not has_line(text, name)]
     assert not missing, f"not in docs/reference/service-file.md: {', '.join(missing)}"
 
 

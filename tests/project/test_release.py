@@ -145,7 +145,7 @@ def test_a_container_installs_what_the_tests_run_with_and_nothing_without_a_hash
     entries = re.split(r"\n(?=[\w.-]+==)", text)[1:]
     assert len(entries) == len(ours) and all("--hash=sha256:" in entry for entry in entries)
     settings = tomllib.loads((project / "pyproject.toml").read_text())["project"]
-    names = "service", "web", "oidc", "mqtt", "opcua", "mdf", "tdms"
+    names = "service", "web", "mqtt", "opcua", "mdf", "tdms"
     extras = [settings["optional-dependencies"][name] for name in names]
     wanted = {re.split(r"[\[>=<]", one)[0].lower() for one in sum(extras, settings["dependencies"])} - {"servoscope"}
     assert wanted <= set(ours)

@@ -15,7 +15,7 @@ from typing import Any
 import httpx
 
 SOURCE = Path(__file__).parents[2] / "src"
-FOUND = re.compile(r"servoscope: (https?://\S+)/ ")
+FOUND = re.compile(r"servoscope: (https?://\S+(?=/ )|unix:\S+)")
 
 
 class Served:

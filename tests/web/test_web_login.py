@@ -14,9 +14,7 @@ import pytest
 from pages_context import open_context
 
 from servoscope.service.access import Role, Users, WebSettings
-from servoscope.service.access.oidc import OidcSettings
 from servoscope.web.app import create_app
-from servoscope.web.oidc_client import OidcClient
 
 PASSWORD = "a long password of hers"
 
@@ -129,23 +127,3 @@ def test_a_client_that_has_gone_is_not_hashed_for(app: Any, users: CountedUsers)
 
     assert asyncio.run(attack()) == 200  # nobody was told anything: nothing was guessed
     assert users.checks == ["vera"]
-
-
-def test_a_provider_that_is_down_is_asked_once_for_all_who_would_log_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody has logged in yet: the server must not hand a flood on to others."""
-    roles, address = {"viewer": ["all"]}, "http://localhost:8080"
-    settings = {"issuer": "https://id.example", "client_id": "hall", "address": address, "roles": roles}
-    client, asked = OidcClient(OidcSettings.model_validate(settings), None), []
-
-    async def fail(url: str, headers: object = None) -> dict[str, Any]:
-        asked.append(url)
-        await asyncio.sleep(0.01)
-        raise client._problem(ValueError("no answer"))
-
-    async def flood() -> list[Any]:
-        attempts = [client.authorization_url("state", "nonce", "verifier" * 8) for _ in range(50)]
-        return await asyncio.gather(*attempts, return_exceptions=True)
-
-    monkeypatch.setattr(client, "_get", fail)
-    assert {str(error) for error in asyncio.run(flood())} == {"https://id.example: no answer"}
-    assert len(asked) == 1

@@ -71,16 +71,12 @@ def create_app(context: Context) -> ASGIApp:
     errors.install_openapi(app)
     errors.install_error_handlers(app)
     router = APIRouter(prefix=API)
-    if context.single_sign_on is not None:
-        from servoscope.web.routes import oidc  # late: it needs an extra
-
-        router.include_router(oidc.router)
     for module in ROUTE_MODULES:
         router.include_router(module.router)
     app.include_router(router)
     _add_health_routes(app, context, metrics)
     _add_pages(app)
-    return SecurityMiddleware(app, context.settings, context.users, context.sessions, metrics)
+    return SecurityMiddleware(app, context, metrics)
 
 
 async def _remove_expired(context: Context) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from fastapi import Depends, HTTPException, Request
 
@@ -15,19 +15,7 @@ from servoscope.web.connections import ConnectionTable
 from servoscope.web.event_hub import EventHub
 from servoscope.web.jobs.queue import JobQueue
 from servoscope.web.login_gate import LoginGate
-from servoscope.web.login_state import LoginStates
 from servoscope.web.storage import FileStorage, UploadStorage
-
-if TYPE_CHECKING:
-    from servoscope.web.oidc_client import OidcClient  # which needs an extra
-
-
-@dataclass(frozen=True)
-class SingleSignOn:
-    """A provider, and the logins that are under way there."""
-
-    client: OidcClient
-    states: LoginStates = field(default_factory=LoginStates)
 
 
 @dataclass(frozen=True)
@@ -44,7 +32,7 @@ class Context:
     users: Users | None  # None: no login by password
     sessions: Sessions
     login_gate: LoginGate = field(default_factory=LoginGate)
-    single_sign_on: SingleSignOn | None = None
+    proxy_secret: bytes | None = None  # of `[web.sign_on]`
     connections: ConnectionTable = field(default_factory=lambda: ConnectionTable(100, 100))
 
 

@@ -13,18 +13,17 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from servoscope.core.errors import AccessError
 from servoscope.core.messages import current_language, languages, speak
-from servoscope.service.access import AllowedHosts, Role, Session, Sessions, Users, WebSettings
-from servoscope.service.access.oidc import CALLBACK
-from servoscope.web.dependencies import LOCAL_PRINCIPAL, Principal
+from servoscope.service.access import AllowedHosts, Session
+from servoscope.web.dependencies import LOCAL_PRINCIPAL, Context, Principal
 from servoscope.web.errors import problem_response
 from servoscope.web.metrics import WebMetrics
 
 API = "/api/v1"
 CSRF = "x-csrf-token"
 SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
-LOGIN_PATH = f"{API}/session/oidc"
-PUBLIC_PATHS = (f"{API}/session", LOGIN_PATH, CALLBACK)  # asked without login: how one logs in
+SESSION_PATH = f"{API}/session"  # asked without login: how one logs in
 CLOCK_COOKIE = "clock"  # the time zone of the browser
 LANGUAGE_COOKIE = "language"  # which the page sets, and whose value is checked
 MAX_BODY_BYTES = 1_000_000  # bytes, but for uploads
@@ -54,11 +53,9 @@ def cookie_name(secure: bool) -> str:
 class SecurityMiddleware:
     """Lets a request pass to the application, or answers in its place."""
 
-    def __init__(
-        self, app: ASGIApp, settings: WebSettings, users: Users | None, sessions: Sessions, metrics: WebMetrics
-    ) -> None:
-        self._app, self._settings, self._users = app, settings, users
-        self._sessions, self._metrics = sessions, metrics
+    def __init__(self, app: ASGIApp, context: Context, metrics: WebMetrics) -> None:
+        self._app, self._context, self._metrics = app, context, metrics
+        self._settings = settings = context.settings
         self._hosts = AllowedHosts.of(settings.listen, settings.hosts)
         # behind a proxy that ends TLS it listens on loopback
         is_respected = settings.secure or not self._hosts.numeric
@@ -104,12 +101,12 @@ class SecurityMiddleware:
         if site not in ("same-origin", "none") and not is_link:
             raise RequestRejection(403, "the request comes from a page of another server")
         if path == "/metrics" or path.startswith("/api"):
-            who = authenticate(headers, self._settings, self._users, self._sessions)
+            who = authenticate(headers, self._context)
             if who is not None:
                 scope["who"] = who
-            elif path not in PUBLIC_PATHS:
+            elif path != SESSION_PATH:
                 raise RequestRejection(401, "log in first")
-            is_login = path in PUBLIC_PATHS and method == "POST"  # a login has no token yet
+            is_login = path == SESSION_PATH and method == "POST"  # a login has no token yet
             if method not in SAFE_METHODS and who is not None and who.session is not None and not is_login:
                 self._check_token(headers, who.session)
         return self._check_size(headers, path)
@@ -138,24 +135,25 @@ class SecurityMiddleware:
             headers.setdefault("strict-transport-security", "max-age=31536000")
 
 
-def authenticate(headers: Headers, settings: WebSettings, users: Users | None, sessions: Sessions) -> Principal | None:
-    """Return the user of a request; None: nobody is logged in."""
+def authenticate(headers: Headers, context: Context) -> Principal | None:
+    """Return the user of a request; None: nobody is logged in. Raises RequestRejection for who may not come in."""
+    settings, users = context.settings, context.users
     if not settings.login:
         return LOCAL_PRINCIPAL
+    if settings.sign_on is not None:
+        try:
+            signed_on = settings.sign_on.identify(headers.getlist, context.proxy_secret)
+        except AccessError as error:
+            raise RequestRejection(403, str(error)) from None
+        if signed_on is not None:
+            return Principal(*signed_on)
     secret = _read_cookie(headers.getlist("cookie"), cookie_name(settings.secure))
-    session = sessions.find(secret, time.monotonic())
-    role = _current_role(session, users) if session is not None else None
-    if session is None or role is None:
+    session = context.sessions.find(secret, time.monotonic())
+    # role and password as they are now: a session ends with its user, and with the user's password
+    role = users.all().get(session.user) if session is not None and users is not None else None
+    if session is None or users is None or role is None or users.stamp(session.user) != session.stamp:
         return None
     return Principal(session.user, role, session, secret)
-
-
-def _current_role(session: Session, users: Users | None) -> Role | None:
-    if session.role is not None or users is None:
-        return session.role
-    # role and password as they are now: a session ends with its user, and with the user's password
-    role = users.all().get(session.user)
-    return role if users.stamp(session.user) == session.stamp else None
 
 
 def request_language(headers: Headers) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import socket
 import sys
 from functools import partial
@@ -16,13 +17,13 @@ from servoscope.core.messages import message, render
 from servoscope.core.sandbox import find_user
 from servoscope.core.workers import ProcessLimits
 from servoscope.service.access import Sessions, Users, WebSettings
-from servoscope.service.access.allowed_hosts import split_address
+from servoscope.service.access.allowed_hosts import UNIX, split_address
 from servoscope.service.config import ServiceFile
 from servoscope.service.process_supervisor import call_at_end_of_stdin
 from servoscope.service.store import Store
 from servoscope.web.app import create_app
 from servoscope.web.connections import ConnectionTable, HttpProtocol, TlsListener
-from servoscope.web.dependencies import Context, SingleSignOn
+from servoscope.web.dependencies import Context
 from servoscope.web.event_hub import EventHub
 from servoscope.web.jobs.queue import JobQueue
 from servoscope.web.storage import FileStorage, UploadStorage
@@ -30,6 +31,7 @@ from servoscope.web.storage import FileStorage, UploadStorage
 STORE_TIMEOUT_S = 5.0  # s
 STOPS_WITHIN_S = 5
 BACKLOG = 1024
+SOCKET_MODE = 0o660  # of a Unix socket: the proxy is in the group of the server
 SEND_BUFFER = 1 << 17  # bytes of each connection; Linux takes them twice
 MAX_CONNECTIONS = 4000
 FILES_ASIDE = 200  # that are open beside connections: store, uploads, jobs
@@ -64,7 +66,7 @@ def run_server(
     Paths in the settings are relative to `folder`. `with_parent`: stop when stdin ends, which the service that
     started the server holds. Raises ServoscopeError if the address or a file is not available.
     """
-    users = Users(folder / settings.users) if settings.users is not None and settings.password_login else None
+    users = Users(folder / settings.users) if settings.users is not None else None
     if users is not None and not users.all():
         file = folder / str(settings.users)
         what = "has no users" if file.exists() else "no such file"
@@ -82,7 +84,7 @@ def run_server(
         jobs=JobQueue(ProcessLimits(settings.job_s, settings.job_memory_mb), settings.job_user),
         users=users,
         sessions=Sessions(settings.session_hours * 3600.0),
-        single_sign_on=_create_single_sign_on(settings, folder),
+        proxy_secret=settings.sign_on.load_secret(folder) if settings.sign_on is not None else None,
         connections=ConnectionTable(_available_connections(), settings.connections_per_address, settings.proxies),
     )
     tls = {}
@@ -91,7 +93,9 @@ def run_server(
         for path in tls.values():
             if not path.is_file():
                 raise ConfigError(f"{path}: no such file, see [web] certificate and key")
-    listening = _bind_socket(settings.listen)
+    listening = (
+        _bind_unix(folder / settings.listen.removeprefix(UNIX)) if settings.on_socket else _bind(settings.listen)
+    )
     if tls:
         listening = TlsListener(fileno=listening.detach())
         listening.table = context.connections
@@ -106,16 +110,6 @@ def run_server(
         store.close()
 
 
-def _create_single_sign_on(settings: WebSettings, folder: Path) -> SingleSignOn | None:
-    """Return the client of the provider; None: there is none. Raises ConfigError if extra or secret are missing."""
-    if settings.oidc is None:
-        return None
-    from servoscope.web.oidc_client import OidcClient  # late: it needs an extra
-
-    secret = settings.oidc.load_secret(folder)
-    return SingleSignOn(OidcClient(settings.oidc, secret.decode(errors="replace") if secret else None))
-
-
 def _uvicorn_config(context: Context, tls: dict[str, Any]) -> uvicorn.Config:
     settings = context.settings
     protocol: Any = partial(HttpProtocol, context.connections)  # uvicorn calls it as it calls a class
@@ -127,8 +121,9 @@ def _uvicorn_config(context: Context, tls: dict[str, Any]) -> uvicorn.Config:
         log_level="warning",
         access_log=False,
         server_header=False,
-        proxy_headers=bool(settings.proxies),  # whoever else connects could write them
-        forwarded_allow_ips=list(settings.proxies),
+        # whoever else connects could write them; a Unix socket is reached by the proxy alone
+        proxy_headers=settings.on_socket or bool(settings.proxies),
+        forwarded_allow_ips="*" if settings.on_socket else list(settings.proxies),
         timeout_graceful_shutdown=STOPS_WITHIN_S,
         h11_max_incomplete_event_size=65536,
         lifespan="on",
@@ -148,7 +143,24 @@ def _available_connections() -> int:
     return MAX_CONNECTIONS if soft < 0 else max(1, min(MAX_CONNECTIONS, soft - FILES_ASIDE))
 
 
-def _bind_socket(address: str) -> socket.socket:
+def _bind_unix(path: Path) -> socket.socket:
+    """Listen on a Unix socket, which its group may use; one that a server before this has left is replaced."""
+    listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        if path.is_socket() and listening.connect_ex(str(path)) == errno.ECONNREFUSED:
+            path.unlink()
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        listening.bind(str(path))
+        path.chmod(SOCKET_MODE)
+        listening.listen(BACKLOG)
+    except OSError as error:
+        listening.close()
+        why = error.strerror or error
+        raise ConfigError(f"[web] listen: {path} cannot be had ({why}), choose another path") from None
+    return listening
+
+
+def _bind(address: str) -> socket.socket:
     host, port = split_address(address)
     try:
         family, *_, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
@@ -170,11 +182,14 @@ def _bind_socket(address: str) -> socket.socket:
 
 def _print_address(settings: WebSettings, listening: socket.socket) -> None:
     """Print the address, and whether there is a login, on stderr."""
-    host, port = listening.getsockname()[:2]
-    name = f"[{host}]" if ":" in host else host
-    scheme = "https" if settings.secure else "http"
+    if settings.on_socket:
+        address = f"{UNIX}{listening.getsockname()}"
+    else:
+        host, port = listening.getsockname()[:2]
+        name = f"[{host}]" if ":" in host else host
+        address = f"{'https' if settings.secure else 'http'}://{name}:{port}/"
     login = message("web.login" if settings.login else "web.no_login")
-    lines = [message("web.address", address=f"{scheme}://{name}:{port}/", login=login)]
-    if settings.login and not settings.secure:
+    lines = [message("web.address", address=address, login=login)]
+    if settings.login and not (settings.secure or settings.on_socket):
         lines.append(message("web.no_tls"))
     print(*map(render, lines), sep="\n", file=sys.stderr, flush=True)

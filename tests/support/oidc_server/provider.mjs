@@ -8,7 +8,7 @@ const server = createServer()
 server.listen(0, '127.0.0.1', () => {
   const issuer = `http://127.0.0.1:${server.address().port}`
   const provider = new Provider(issuer, {
-    clients: [{ client_id: 'hall', client_secret: secret, redirect_uris: [callback] }],
+    clients: [{ client_id: 'servoscope', client_secret: secret, redirect_uris: [callback] }],
     claims: { openid: ['sub'], profile: ['preferred_username', 'groups'] },
     cookies: { keys: ['of the tests'] },
     findAccount: (_, id) => {

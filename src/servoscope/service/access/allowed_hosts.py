@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 DEFAULT_PORTS = {"http": 80, "https": 443}
+UNIX = "unix:"  # before the path of a socket
 
 
 def split_address(address: str) -> tuple[str, int]:
@@ -45,7 +46,7 @@ class AllowedHosts:
     @classmethod
     def of(cls, listen: str, names: Iterable[str]) -> AllowedHosts:
         """Return what a server that listens there is called."""
-        host, _ = split_address(listen)
+        host = LOOPBACK[0] if listen.startswith(UNIX) else split_address(listen)[0]
         return cls(frozenset(name.lower() for name in (*LOOPBACK, host, *names)), not is_loopback(host))
 
     def known(self, host: str) -> bool:

@@ -8,8 +8,6 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from servoscope.service.access.users import Role
-
 MAX_ENTRIES = 10_000  # sessions, and addresses that have failed: what is remembered is bounded
 PENDING_S = 1.0  # s: within which attempts that are being checked have ended
 
@@ -19,10 +17,9 @@ class Session:
     """One login."""
 
     user: str
-    stamp: str  # of the user's password; empty where there is none
+    stamp: str  # of the user's password
     csrf: str  # what a request that changes something must repeat: a foreign page cannot know it
     expires: float  # by the monotonic clock [s]: one that is set must neither end nor prolong it
-    role: Role | None = None  # that a provider has given for as long as it lasts; None: that of the file of users
 
 
 class Sessions:
@@ -32,13 +29,13 @@ class Sessions:
         self._lasts = lasts_s
         self._of: dict[str, Session] = {}
 
-    def begin(self, user: str, stamp: str, now: float, role: Role | None = None) -> tuple[str, Session]:
+    def begin(self, user: str, stamp: str, now: float) -> tuple[str, Session]:
         """Return the secret of a new session, and the session; `now` is by the monotonic clock [s]."""
         self._of = {key: session for key, session in self._of.items() if session.expires > now}
         while len(self._of) >= MAX_ENTRIES:
             del self._of[next(iter(self._of))]
         secret = secrets.token_urlsafe(32)
-        session = Session(user, stamp, secrets.token_urlsafe(32), now + self._lasts, role)
+        session = Session(user, stamp, secrets.token_urlsafe(32), now + self._lasts)
         self._of[_digest(secret)] = session
         return secret, session
 

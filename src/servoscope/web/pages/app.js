@@ -87,7 +87,8 @@ function introduce(session) {
     person.replaceChildren(h("span", { title: "Only this machine reaches the pages, and it may do everything" }, "no login: this machine only"));
   } else if (session.user) {
     const out = h("button", { type: "button", class: "quiet", onclick: async () => (await api.logout(), logIn()) }, "Log out");
-    person.replaceChildren(h("span", {}, `${session.user}, ${session.role}`), out);
+    // whom a proxy has signed in has no session to end here
+    person.replaceChildren(h("span", {}, `${session.user}, ${session.role}`), ...(session.csrf ? [out] : []));
   }
 }
 

@@ -1,19 +1,13 @@
 // Asks who is there, and goes on to where they wanted to be.
-import { login, Problem, query, session as ask } from "./api.js";
+import { login, Problem, session as ask } from "./api.js";
 import { complaint, field, h } from "./dom.js";
-
-const REFUSED = {
-  state: "The login took too long, or began in another browser: try again.",
-  provider: "The provider did not confirm the login: try again, or ask who runs this server to look into its log.",
-  role: "You are known to the provider, but have no role here: ask who runs this server.",
-};
 
 export async function show(main, { session, values }) {
   // Only to our own pages: an address of elsewhere could imitate them.
   const next = new URL(values.get("next") ?? "/", location.origin);
   const target = next.origin === location.origin ? next.pathname + next.search : "/";
   if (!session.login_required || session.user) return location.replace(target);
-  const { element, user } = form("Log in", () => location.replace(target), { session, target, note: REFUSED[values.get("refused")] });
+  const { element, user } = form("Log in", () => location.replace(target), { session, target });
   main.replaceChildren(element);
   user?.focus();
 }
@@ -35,12 +29,12 @@ export async function again() {
   });
 }
 
-// With `target`, the page that a provider leads back to; without, its login is in another tab, and the page stays.
+// With `target`, the page that a login leads to; without, a login is in another tab, and the page stays.
 function form(title, done, { session, target = null, note = null }) {
-  const way = query("/api/v1/session/oidc", { next: target ?? "/" });
-  const provider = session.single_sign_on && h("a", { class: "button", href: way, target: target ? null : "_blank" }, session.single_sign_on);
   if (!session.password_login) {
-    return { element: h("div", { class: "login" }, h("h1", {}, title), note && h("p", { class: "note" }, note), h("div", {}, provider, !target && renew(done))), user: null };
+    const signOn = h("a", { class: "button", href: target ?? "/", target: target ? null : "_blank" }, "Try again");
+    const why = "The proxy in front of these pages signs users in, and has named nobody: try again, or ask who runs this server.";
+    return { element: h("div", { class: "login" }, h("h1", {}, title), h("p", { class: "note" }, why), h("div", {}, signOn, !target && renew(done))), user: null };
   }
   const user = h("input", { name: "user", autocomplete: "username", required: true, autofocus: true });
   const password = h("input", { name: "password", type: "password", autocomplete: "current-password", required: true });
@@ -61,7 +55,7 @@ function form(title, done, { session, target = null, note = null }) {
       button.disabled = false;
     }
   };
-  const element = h("form", { class: "login", onsubmit: enter }, h("h1", {}, title), note && h("p", { class: "note" }, note), field("User", user), field("Password", password), said, h("div", {}, button, provider, provider && !target && renew(done)));
+  const element = h("form", { class: "login", onsubmit: enter }, h("h1", {}, title), note && h("p", { class: "note" }, note), field("User", user), field("Password", password), said, h("div", {}, button));
   return { element, user };
 }
 

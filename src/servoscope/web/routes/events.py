@@ -36,7 +36,7 @@ async def stream_events(
         await asyncio.to_thread(find_asset, context, query.asset)
 
     def is_permitted() -> bool:
-        return authenticate(request.headers, context.settings, context.users, context.sessions) is not None
+        return authenticate(request.headers, context) is not None
 
     async def counted() -> AsyncIterator[bytes]:
         with request.app.state.metrics.event_readers.track_inprogress():

@@ -22,7 +22,7 @@ def _session_response(context: Context, who: Principal | None) -> SessionRespons
     return SessionResponse(
         login_required=context.settings.login,
         password_login=context.users is not None,
-        single_sign_on=context.settings.oidc.label if context.settings.oidc is not None else None,
+        single_sign_on=None,
         user=who.user if who is not None else None,
         role=who.role if who is not None else None,
         csrf=session.csrf if session is not None else None,

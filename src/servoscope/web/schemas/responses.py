@@ -44,7 +44,7 @@ class SessionResponse(ApiResponse):
 
     login_required: bool
     password_login: bool
-    single_sign_on: str | None  # label of its button, which leads to /api/v1/session/oidc?next=PAGE
+    single_sign_on: None  # always null since 2.0: a proxy signs users in before a page loads
     user: str | None
     role: Role | None
     csrf: str | None
