@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numba
@@ -48,15 +49,21 @@ AXES = {
 
 
 @numba.njit(cache=True)
-def _run(r, p, q, switch, n_y, n_u, gains, limit, dt, substeps):  # type: ignore[no-untyped-def]
-    """Return u and y; cascade of position and velocity loop, semi-implicit Euler between the samples."""
+def _run(r, axes, switches, n_y, n_u, gains, limit, dt, substeps):  # type: ignore[no-untyped-def]
+    """Return u and y; cascade of position and velocity loop, semi-implicit Euler between the samples.
+
+    `axes` (S, 13) holds from the samples `switches` (S,) on.
+    """
     N = len(r)
     u, y = np.zeros(N), np.zeros(N)
     x, v, xl, vl, integral, before = r[0], 0.0, r[0], 0.0, 0.0, r[0]
     speed = 0.0
     h = dt / substeps
+    at = 0
     for k in range(N):
-        m, b, c, gain, static, v_s, cogging, pitch, w, share, load_force, shift, slack = p if k < switch else q
+        while at + 1 < len(switches) and k >= switches[at + 1]:
+            at += 1
+        m, b, c, gain, static, v_s, cogging, pitch, w, share, load_force, shift, slack = axes[at]
         y[k] = x + shift + n_y[k]
         speed += 0.5 * ((y[k] - before) / dt - speed)
         before = y[k]
@@ -109,29 +116,24 @@ def random_motion(seed: int, hz: float = 2.0, acceleration: float = 6.0, seconds
 
 def record(axis: Axis, r: FloatArray, seed: int, faulty: Axis | None = None, at: float = 30.0) -> ss.Recording:
     """Simulate an axis, which is another one from a time on [s]."""
+    return record_course([(0.0, axis), (at, faulty or axis)], r, seed)
+
+
+def record_course(course: Sequence[tuple[float, Axis]], r: FloatArray, seed: int) -> ss.Recording:
+    """Simulate an axis that changes: each holds from its time [s] on."""
     rng = np.random.default_rng(seed)
-    p, q = (
-        (
-            a.mass,
-            a.viscous,
-            a.coulomb,
-            a.gain,
-            a.static,
-            a.stribeck_speed,
-            a.cogging,
-            PITCH,
-            2.0 * np.pi * a.belt_hz,
-            a.load_share,
-            a.load,
-            a.shift,
-            a.slack,
-        )
-        for a in (axis, faulty or axis)
-    )
+    axes = np.array([_parameters(axis) for _, axis in course])
+    switches = np.array([round(at * RATE) for at, _ in course])
     noise_y, noise_u = NOISE_Y * rng.normal(size=len(r)), NOISE_U * rng.normal(size=len(r))
     gains = (POSITION_GAIN, VELOCITY_GAIN, INTEGRAL_GAIN)
-    u, y = _run(r, p, q, round(at * RATE), noise_y, noise_u, gains, LIMIT, 1.0 / RATE, SUBSTEPS)
+    u, y = _run(r, axes, switches, noise_y, noise_u, gains, LIMIT, 1.0 / RATE, SUBSTEPS)
     return _recording(r, u, y, seed)
+
+
+def _parameters(a: Axis) -> tuple[float, ...]:
+    friction = a.mass, a.viscous, a.coulomb, a.gain, a.static, a.stribeck_speed
+    belt = 2.0 * np.pi * a.belt_hz, a.load_share
+    return (*friction, a.cogging, PITCH, *belt, a.load, a.shift, a.slack)
 
 
 @functools.cache

@@ -1,0 +1,75 @@
+"""What the sums of healthy recordings teach: coefficients, noise, and how coefficients scatter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.sums.evidence import ChangePrior, posterior
+from servoscope.sums.records import Equations, Sums
+
+CHANGE_STD = 0.5  # standard deviation of a change, relative to the coefficient
+CHANGE_COST = 3.0  # nats that a stretch with coefficients of its own has to gain
+EFFECT_STEPS = 4  # of reweighting
+
+
+@dataclass(frozen=True, eq=False)
+class Healthy:
+    """Healthy coefficients of a block: ``theta x + B + E_stretch + E_block``, each effect with its covariance."""
+
+    equations: Equations
+    theta: FloatArray  # by covariate, shape (p, m)
+    unit: FloatArray  # what a coefficient's scatter and changes are relative to, shape (p,)
+    kappa: float  # of the noise: the covariance of a block's score is kappa A
+    between_blocks: FloatArray  # covariances (p, p): of the model's error by block,
+    within: FloatArray  # of stretches of one recording,
+    between: FloatArray  # and of recordings
+    inflation: float  # of the covariance of long stretches, for neighbouring blocks err alike
+    degrees: float  # of freedom that `between` is known with
+    moments: FloatArray  # inverse of the moments of the covariates, shape (m, m)
+    left_out: tuple[float, ...] = ()  # evidence of each healthy recording when it is left out of learning
+    limit: float = 0.0  # of the evidence
+
+    def mean(self, x: FloatArray) -> FloatArray:
+        """Return the coefficients (p,) to expect at covariates (m,)."""
+        return np.asarray(self.theta @ x)
+
+    def scatter(self, x: FloatArray) -> FloatArray:
+        """Return the covariance (p, p) of the effect of a recording: it grows outside of the covariates learned."""
+        return np.asarray(self.between * (1.0 + float(x @ self.moments @ x)))
+
+    def information(self, sums: Sums, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return information (K, p, p) and score (K, p) of each block about coefficients (p,)."""
+        A, g = sums.A, sums.c - sums.A @ theta
+        V = self.kappa * A + A @ self.between_blocks @ A
+        V += np.diag(1e-9 * np.diag(V.mean(axis=0)) + np.finfo(np.float64).tiny)
+        solved = np.linalg.solve(V, np.concatenate([A, g[..., None]], axis=2)) / self.inflation
+        M = A @ solved[..., :-1]
+        return 0.5 * (M + np.swapaxes(M, 1, 2)), np.einsum("kij,kj->ki", A, solved[..., -1])
+
+    def change_prior(self, x: FloatArray) -> ChangePrior:
+        """Return how coefficients deviate: as healthy ones, by one cause, or anyhow."""
+        causes = self.equations.causes(self.mean(x))
+        directions = np.column_stack([c.direction for c in causes]) if causes else np.diag(self.unit)
+        return ChangePrior(self.within, self.wide, CHANGE_STD * directions, CHANGE_COST)
+
+    @cached_property
+    def wide(self) -> FloatArray:
+        """The covariance (p, p) of a change of all coefficients."""
+        return np.diag((CHANGE_STD * self.unit) ** 2)
+
+    def effect(self, M: FloatArray, w: FloatArray, scatter: FloatArray) -> FloatArray:
+        """Return the likeliest effect (p,) of a recording: multivariate t, for few recordings show the scatter."""
+        B, p, precision = np.zeros(len(w)), len(w), np.linalg.inv(scatter)
+        for _ in range(EFFECT_STEPS):
+            weight = (self.degrees + B @ precision @ B) / (self.degrees + p)
+            B = posterior(M, w, scatter * weight)[0]
+        return B
+
+    def effect_cost(self, B: FloatArray, scatter: FloatArray) -> float:
+        """Return how much less likely an effect is than none [nats]."""
+        square = float(B @ np.linalg.solve(scatter, B))
+        return 0.5 * (self.degrees + len(B)) * float(np.log1p(square / self.degrees))

@@ -1,0 +1,101 @@
+"""Optimal partitioning of a recording into stretches with constant coefficients, healthy or changed (Jackson, 2005)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray, IntArray
+from servoscope.sums.evidence import ChangePrior
+
+GRID = 100  # stretches between the times that are tried first; around the changes found, finer ones are
+CONSPICUOUS = 30  # short windows, at most, whose ends are tried as well
+FINER = 4  # times
+
+
+class Stretch(NamedTuple):
+    """Blocks `begin` to `end` of a recording."""
+
+    begin: int
+    end: int
+    changed: bool
+
+    @property
+    def inside(self) -> int:
+        """The first block that is not the one within which the change before came."""
+        return self.begin + (0 < self.begin < self.end - 1)
+
+
+class Partition(NamedTuple):
+    """The likeliest stretches of a recording, and their evidence less what their number costs [nats]."""
+
+    evidence: float
+    stretches: tuple[Stretch, ...]
+
+
+def running_sums(a: FloatArray) -> FloatArray:
+    """Return the sums of all rows before each, shape (K + 1, ...)."""
+    return np.concatenate([np.zeros_like(a[:1]), np.cumsum(a, axis=0)])
+
+
+def partition(M: FloatArray, w: FloatArray, prior: ChangePrior, cut: float, shortest: int) -> Partition:
+    """Cut a recording where that explains it best; a cut costs `cut` nats, a stretch has `shortest` blocks or more.
+
+    M (K + 1, p, p) and w (K + 1, p) are running sums. Times of change are sought on a grid that is as fine as blocks
+    only around those found, and around short windows that look changed by themselves: hours cost what minutes do.
+    """
+    K = len(w) - 1
+    step = max(1, -(-K // GRID))
+    grid = np.unique(np.concatenate([np.arange(0, K, step), _conspicuous_ends(M, w, prior, shortest), [K]]))
+    while True:
+        best = _best_on_grid(M, w, prior, cut, shortest, grid)
+        finer = _refined(grid, [s.begin for s in best.stretches[1:]])
+        if len(finer) == len(grid):
+            return best
+        grid = finer
+
+
+def _conspicuous_ends(M: FloatArray, w: FloatArray, prior: ChangePrior, length: int) -> IntArray:
+    ends = np.arange(0, len(w), max(length, 1))
+    healthy, changed = prior.evidence(M[ends[1:]] - M[ends[:-1]], w[ends[1:]] - w[ends[:-1]])
+    order = np.argsort(healthy - changed)[:CONSPICUOUS]
+    order = order[(changed > healthy)[order]]
+    return np.concatenate([ends[order], ends[order + 1]])
+
+
+def _refined(grid: IntArray, cuts: list[int]) -> IntArray:
+    added = [grid]
+    for cut in cuts:
+        at = int(np.searchsorted(grid, cut))
+        low, high = grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]
+        added.append(np.arange(low, high, max(int(high - low) // (2 * FINER), 1)))
+    return np.unique(np.concatenate(added))
+
+
+def _best_on_grid(
+    M: FloatArray, w: FloatArray, prior: ChangePrior, cut: float, shortest: int, grid: IntArray
+) -> Partition:
+    shortest = min(shortest, int(grid[-1]))
+    first, last = np.nonzero(grid[None, :] - grid[:, None] >= shortest)
+    begin, end = grid[first], grid[last]
+    whole = prior.evidence(M[end] - M[begin], w[end] - w[begin])
+    # a block within which coefficients change has some of its own
+    own = prior.evidence(M[grid[:-1] + 1] - M[grid[:-1]], w[grid[:-1] + 1] - w[grid[:-1]])[1][first]
+    without = prior.evidence(M[end] - M[begin + 1], w[end] - w[begin + 1])
+    own[(begin == 0) | (end - begin == 1)] = -np.inf
+    healthy, changed = np.full((2, len(grid), len(grid)), -np.inf)
+    healthy[first, last], changed[first, last] = (np.maximum(a, b + own) for a, b in zip(whole, without, strict=True))
+    single = np.maximum(healthy, changed) - cut
+    best, previous = np.full(len(grid), -np.inf), np.zeros(len(grid), dtype=np.int64)
+    best[0] = cut  # the first stretch needs no cut
+    for j in range(1, len(grid)):
+        total = best + single[:, j]
+        previous[j] = int(np.argmax(total))
+        best[j] = total[previous[j]]
+    stretches, j = list[Stretch](), len(grid) - 1
+    while j > 0:
+        i = int(previous[j])
+        stretches.append(Stretch(int(grid[i]), int(grid[j]), bool(changed[i, j] > healthy[i, j])))
+        j = i
+    return Partition(float(best[-1]), tuple(stretches[::-1]))

@@ -1,0 +1,137 @@
+"""A recording against healthy: the best account with changes of its coefficients, compared with the best without."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.sums.evidence import ChangePrior, evidence, posterior
+from servoscope.sums.explanation import explanations
+from servoscope.sums.healthy import CHANGE_COST, Healthy
+from servoscope.sums.partition import Stretch, partition, running_sums
+from servoscope.sums.records import Explanation, Segment, Sums, Times, Verdict
+
+CUT_COST = 8.0  # nats that a time of change has to gain
+MIN_S = 3.0  # shortest stretch [s]
+ROUNDS = 2  # in which stretches and the recording's effect are found in turn
+TAIL = 0.025  # of a time, on each side of its interval
+
+
+class _Account(NamedTuple):
+    """Stretches of a recording and its own effect, and the evidence of both."""
+
+    evidence: float
+    stretches: tuple[Stretch, ...]
+
+
+class _Judgement:
+    """Running sums of one recording, and the scatter that it may have."""
+
+    def __init__(self, healthy: Healthy, sums: Sums) -> None:
+        self.healthy, self.sums = healthy, sums
+        self.mean = healthy.mean(sums.x)
+        M, w = healthy.information(sums, self.mean)
+        self.M, self.w, self.blocks = running_sums(M), running_sums(w), len(w)
+        self.scatter = healthy.scatter(sums.x)
+        self.prior: ChangePrior = healthy.change_prior(sums.x)
+        self.shortest = max(round(MIN_S / sums.block_s), 2)
+
+    def of(self, begin: int, end: int) -> tuple[FloatArray, FloatArray]:
+        """Return information and score of some blocks."""
+        return self.M[end] - self.M[begin], self.w[end] - self.w[begin]
+
+    def of_healthy(self, stretches: tuple[Stretch, ...]) -> tuple[FloatArray, FloatArray]:
+        """Return information and score of all stretches that are not changed."""
+        M, w = np.zeros_like(self.M[0]), np.zeros_like(self.w[0])
+        for part in stretches:
+            if not part.changed:
+                of_part = self.of(part.inside, part.end)
+                M, w = M + of_part[0], w + of_part[1]
+        return M, w
+
+    def gain(self, B: FloatArray) -> float:
+        """Return the evidence of the recording's effect (p,)."""
+        M, w = self.M[-1], self.w[-1]
+        return float(w @ B - 0.5 * B @ M @ B) - self.healthy.effect_cost(B, self.scatter)
+
+    def effect(self, M: FloatArray, w: FloatArray) -> FloatArray:
+        """Return the likeliest effect of the recording, of information and score of its healthy stretches."""
+        return self.healthy.effect(M, w, self.scatter)
+
+    def without_change(self) -> float:
+        """Return the evidence of the best account without a change."""
+        M, w = self.M[-1], self.w[-1]
+        return max(
+            self.gain(B) + float(evidence(M, w - M @ B, self.healthy.within))
+            for B in (np.zeros(len(w)), self.effect(M, w))
+        )
+
+    def with_changes(self) -> _Account:
+        """Return the best account with a change; where no time of change pays, the whole recording is changed."""
+        whole, begin = self.of(0, self.blocks), self.of(0, max(self.blocks // 4, 1))
+        prior = self.prior._replace(inside=self.healthy.within + self.scatter)
+        best = _Account(float(prior.evidence(*whole)[1]), (Stretch(0, self.blocks, True),))
+        for B in (np.zeros(len(whole[1])), self.effect(*whole), self.effect(*begin)):
+            for _ in range(ROUNDS):
+                cut = partition(self.M, self.w - self.M @ B, self.prior, CUT_COST, self.shortest)
+                total = self.gain(B) + cut.evidence
+                if total > best.evidence and any(part.changed for part in cut.stretches):
+                    best = _Account(total, cut.stretches)
+                if all(part.changed for part in cut.stretches):
+                    break
+                B = self.effect(*self.of_healthy(cut.stretches))
+        return best
+
+    def segments(self, stretches: tuple[Stretch, ...]) -> tuple[Segment, ...]:
+        """Return what each stretch shows."""
+        M, w = self.of_healthy(stretches)
+        B, P = posterior(M, w, self.scatter)
+        alone = all(part.changed for part in stretches)
+        dates = self._dates(stretches, B)
+        segments = []
+        for part, begin, end in zip(stretches, dates[:-1], dates[1:], strict=True):
+            M, w = self.of(part.inside, part.end)
+            w, S = w - M @ B, P + self.healthy.within
+            moved, covariance = posterior(M, w, S + self.healthy.wide * part.changed)
+            causes: tuple[Explanation, ...] = ()
+            if part.changed:
+                degrees = self.healthy.degrees if alone else np.inf
+                causes = explanations(self.healthy, self.mean + B, M, w, S, degrees)
+            segments.append(Segment(begin, end, part.changed, self.mean + B + moved, covariance, self.mean + B, causes))
+        return tuple(segments)
+
+    def _dates(self, stretches: tuple[Stretch, ...], B: FloatArray) -> list[Times]:
+        """Return when each stretch begins, and the end; the interval is by the evidence of times between neighbours."""
+        t, block_s = self.sums.begin_s, self.sums.block_s
+        begin, end = float(t[0]), float(t[-1]) + block_s
+        dates = [(begin, begin, begin)]
+        for before, after in pairwise(stretches):
+            at = np.arange(before.begin + 1, after.end)
+            at = at[np.abs(at - after.begin) <= 4 * self.shortest]
+            total = np.zeros(len(at))
+            for kind, M, w in (
+                (before.changed, self.M[at] - self.M[before.begin], self.w[at] - self.w[before.begin]),
+                (after.changed, self.M[after.end] - self.M[at], self.w[after.end] - self.w[at]),
+            ):
+                total += self.prior.evidence(M, w - M @ B)[int(kind)]
+            share = np.cumsum(np.exp(total - total.max()))
+            low, high = at[np.searchsorted(share / share[-1], (TAIL, 1.0 - TAIL))]
+            low, high = min(low, after.begin), max(high, after.begin)
+            dates.append(
+                (max(float(t[low]) - block_s, begin), float(t[after.begin]), min(float(t[high]) + block_s, end))
+            )
+        return [*dates, (end, end, end)]
+
+
+def judge(healthy: Healthy, sums: Sums) -> Verdict:
+    """Return whether a recording is healthy; if not, which coefficients changed, when, by how much, and why."""
+    judgement = _Judgement(healthy, sums)
+    account = judgement.with_changes()
+    # the limit stands for the odds of a change; of those of its time, only the choice among blocks is paid for
+    odds = CHANGE_COST + (CUT_COST - float(np.log(judgement.blocks)) if len(account.stretches) > 1 else 0.0)
+    total = account.evidence - judgement.without_change() + odds
+    stretches = account.stretches if total > healthy.limit else (Stretch(0, judgement.blocks, False),)
+    return Verdict(total, healthy.limit, judgement.segments(stretches))
