@@ -7,7 +7,7 @@ import pytest
 
 from servoscope.core.arrays import FloatArray
 from servoscope.sums.evidence import directional_evidence, evidence, posterior
-from servoscope.sums.learning import learn, predictive_limit
+from servoscope.sums.learning import learn
 from servoscope.sums.records import FaultDirection, Sums
 from servoscope.sums.verdict import judge
 
@@ -53,11 +53,6 @@ def test_posterior() -> None:
     assert P.ravel() == pytest.approx([0.1282051282, -0.0256410256, -0.0256410256, 0.2051282051], abs=1e-9)
 
 
-def test_limit() -> None:
-    assert predictive_limit([-3.0, -2.5, 1.0, -3.5], 0.01) == pytest.approx(4.605170185988092, abs=1e-12)
-    assert predictive_limit([-3.0, 6.0, 1.0, -3.5], 0.01) == pytest.approx(8.99573227355399, abs=1e-12)
-
-
 def test_learned_and_judged() -> None:
     healthy = learn(Friction(), [recording(day) for day in range(5)])
     # the program stops its maximisation by a rule that depends on units
@@ -68,9 +63,12 @@ def test_learned_and_judged() -> None:
     changed = judge(healthy, recording(8, 22))
     assert changed.evidence == pytest.approx(3391.57, rel=0.05)
     assert [(s.begin_s[1], s.end_s[1], s.changed) for s in changed.segments] == [(0.0, 11.0, False), (11.0, 20.0, True)]
-    (ratio,) = changed.segments[1].explanations[0].ratios
-    assert ratio.cause == "coulomb"
-    assert ratio.ratio == pytest.approx(1.3, abs=2e-3)  # to what this recording was before
-    common = changed.segments[1].healthy[1] / healthy.theta[1, 0]  # the program's ratio is to the mean of recordings
-    told = [1.0 + (x - 1.0) * common for x in (ratio.ratio, ratio.low, ratio.high)]
+    segment, explanation = changed.segments[1], changed.segments[1].explanations[0]
+    low, likely, high = explanation.ratios["coulomb"]
+    assert explanation.causes == ("coulomb",)
+    assert likely == pytest.approx(1.3, abs=2e-3)  # to what this recording was before
+    # the program's ratio is to the mean of recordings
+    coulomb = healthy.theta[1, 0]
+    before = (coulomb + segment.deviation[1]) / likely
+    told = [1.0 + (x - 1.0) * before / coulomb for x in (likely, low, high)]
     assert told == pytest.approx([1.30305, 1.29273, 1.31338], abs=1e-3)

@@ -19,6 +19,7 @@ from servoscope.core.messages import Message
 VerdictKind = Literal["healthy", "suspect", "fault", "undetermined"]
 
 FALSE_ALARMS = 0.01  # share of healthy recordings that may be called suspect
+NORMAL_95 = 1.959963984540054  # of the normal distribution, 97.5 % below it
 SURE_LIMITS = 3.0  # limits from which one recording alone is a fault
 
 
@@ -30,6 +31,21 @@ class Explanation(NamedTuple):
     sizes: FloatArray  # logarithms of the ratios of its parameters, shape (k,)
     covariance: FloatArray  # of `sizes`, (k, k)
     text: Message | None = None
+    alike: tuple[Explanation, ...] = ()  # other sets that move the same coefficients: no recording tells which it is
+
+    @property
+    def probability(self) -> float:
+        """The probability of this set, or of one that is alike."""
+        return float(1.0 / (1.0 + np.exp(-np.clip(self.log_odds, -700.0, 700.0))))
+
+    @property
+    def ratios(self) -> dict[str, tuple[float, float, float]]:
+        """The ratio of each cause's parameter to its healthy value, with its 95 % interval: low, likely, high."""
+        std = np.sqrt(np.diag(self.covariance).clip(0.0))
+        ends = np.exp(self.sizes[:, None] + NORMAL_95 * std[:, None] * np.array([-1.0, 0.0, 1.0]))
+        return {
+            cause: (low, likely, high) for cause, (low, likely, high) in zip(self.causes, ends.tolist(), strict=True)
+        }
 
 
 class Segment(NamedTuple):

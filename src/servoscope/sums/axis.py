@@ -10,12 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.core.verdict import Segment
 from servoscope.estimation.frequency_response import FrequencyResponse, frequency_response
 from servoscope.estimation.pipeline import Pipeline, Regression, RegressionRunner
 from servoscope.models.loop import Loop
 from servoscope.models.plants.terms import TermPlant
 from servoscope.signals import Recording
-from servoscope.sums.records import FaultDirection, Segment, Sums
+from servoscope.sums.healthy import Healthy
+from servoscope.sums.records import FaultDirection, Sums
 
 BLOCK_S = 0.5
 MIN_PERIODS = 2.0  # of the cutoff in a block, so that it outlasts the memory of the filters
@@ -102,11 +104,14 @@ class AxisEquations:
         return SumsRunner(self).advance(recording)
 
 
-def response(equations: AxisEquations, segment: Segment, frequencies: npt.ArrayLike) -> FrequencyResponse:
-    """Return the inverse frequency response of a stretch, with its covariance; frequencies (F,) in Hz."""
+def response(healthy: Healthy, segment: Segment, frequencies: npt.ArrayLike) -> FrequencyResponse:
+    """Return the inverse frequency response of a stretch of an axis, with its covariance; frequencies (F,) in Hz."""
+    equations = healthy.equations
+    assert isinstance(equations, AxisEquations)
     bank = equations.pipeline.bank
     at = [equations.names.index(name) for name in bank.names]
-    return frequency_response(bank, frequencies, segment.theta[at], segment.covariance[np.ix_(at, at)])
+    theta = healthy.mean(np.ones(1)) + segment.deviation
+    return frequency_response(bank, frequencies, theta[at], segment.covariance[np.ix_(at, at)])
 
 
 class SumsRunner:

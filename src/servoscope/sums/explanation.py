@@ -9,16 +9,19 @@ from typing import NamedTuple
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
+from servoscope.core.verdict import Explanation
 from servoscope.sums.evidence import evidence
 from servoscope.sums.healthy import CHANGE_STD, Healthy
-from servoscope.sums.records import FaultDirection, Explanation, Ratio
+from servoscope.sums.records import FaultDirection
 
 MAX_CAUSES = 3  # causes at once
 CAUSE_COST = 3.0  # nats that each cause has to gain
 MIN_SINGULAR = 0.05  # smallest singular value over the largest, from which coefficients show all causes of a set
 MAX_PROJECTION_DIFFERENCE = 0.02  # difference of projections, below which two sets of causes move the same coefficients
 MIN_RATIO = 1e-3
+MAX_BEHIND = 10.0  # nats behind the likeliest set, from which one is not told
 MAX_DEGREES = 1e6
+TAIL = 0.025  # of an interval, on each side
 
 
 class _Set(NamedTuple):
@@ -31,7 +34,7 @@ class _Set(NamedTuple):
 def explanations(
     healthy: Healthy, reference: FloatArray, M: FloatArray, w: FloatArray, S: FloatArray, degrees: float
 ) -> tuple[Explanation, ...]:
-    """Return sets of causes that explain a stretch, by their probability; they add up to 1.
+    """Return the sets of causes that explain a stretch, the likeliest first.
 
     `reference` (p,): what the coefficients would be if healthy; M and w: information and score about it; S (p, p):
     the covariance of a healthy stretch, known with so many degrees of freedom.
@@ -44,16 +47,19 @@ def explanations(
         odds = float(evidence(M, w, S + D @ D.T)) - none - CAUSE_COST * D.shape[1]
         weighed.append((odds, causes_set.causes))
     fixed = len(w) - len(healthy.equations.free)
-    if all(
-        np.linalg.matrix_rank(causes_set.projection) < fixed for causes_set in sets
-    ):  # no set of causes explains everything
+    # where no set of causes explains everything
+    if all(np.linalg.matrix_rank(causes_set.projection) < fixed for causes_set in sets):
         weighed.append((float(evidence(M, w, S + healthy.wide)) - none - CAUSE_COST * MAX_CAUSES, []))
     weighed.sort(key=lambda entry: -entry[0])
-    weights = np.exp([odds - weighed[0][0] for odds, _ in weighed])
+    nats = np.array([odds for odds, _ in weighed])
     results = []
-    for (odds, causes), probability in zip(weighed, (weights / weights.sum()).tolist(), strict=True):
-        told = [_ratios(M, w, S, some, degrees) for some in causes]
-        results.append(Explanation(told[0] if told else (), probability, odds, tuple(told[1:])))
+    for i, (odds, causes) in enumerate(weighed):
+        if odds < nats[0] - MAX_BEHIND:
+            break
+        log_odds = odds - float(np.logaddexp.reduce(np.delete(nats, i), initial=-np.inf)) if len(nats) > 1 else np.inf
+        told = [_explanation(M, w, S, some, log_odds, degrees) for some in causes]
+        unknown = Explanation((), log_odds, np.zeros(0), np.zeros((0, 0)))
+        results.append(told[0]._replace(alike=tuple(told[1:])) if told else unknown)
     return tuple(results)
 
 
@@ -83,20 +89,20 @@ def _alike(projection: FloatArray, other: FloatArray) -> bool:
     return float(np.abs(projection - other).max()) < MAX_PROJECTION_DIFFERENCE
 
 
-def _ratios(
-    M: FloatArray, w: FloatArray, S: FloatArray, causes: Sequence[FaultDirection], degrees: float
-) -> tuple[Ratio, ...]:
-    """Return the generalised least-squares sizes of causes; the healthy scatter S counts as noise."""
+def _explanation(
+    M: FloatArray, w: FloatArray, S: FloatArray, causes: Sequence[FaultDirection], log_odds: float, degrees: float
+) -> Explanation:
+    """Return causes with their generalised least-squares sizes; the healthy scatter S counts as noise."""
+    from scipy.stats import norm
     from scipy.stats import t as student
 
     D = np.column_stack([cause.direction for cause in causes])
     solved = np.linalg.solve(np.eye(len(w)) + M @ S, np.column_stack([M @ D, w]))  # (M^-1 + S)^-1 [D, deviation]
     covariance = np.linalg.inv(D.T @ solved[:, :-1] + 1e-9 * np.eye(len(causes)))
     size = covariance @ (D.T @ solved[:, -1])
-    std = float(student.ppf(0.975, min(degrees, MAX_DEGREES))) * np.sqrt(np.diag(covariance).clip(0.0))
-    gain = 1.0 + sum(float(v) for cause, v in zip(causes, size, strict=True) if cause.multiplies_all)
-    ratios = []
-    for cause, v, e in zip(causes, size.tolist(), std.tolist(), strict=True):
-        over = 1.0 if cause.multiplies_all else max(gain, MIN_RATIO)
-        ratios.append(Ratio(cause.name, *(max(1.0 + x / over, MIN_RATIO) for x in (v, v - e, v + e))))
-    return tuple(ratios)
+    gains = np.array([cause.multiplies_all for cause in causes])
+    over = np.where(gains, 1.0, max(1.0 + float(size[gains].sum()), MIN_RATIO))
+    ratio = np.maximum(1.0 + size / over, MIN_RATIO)
+    wider = student.ppf(TAIL, min(degrees, MAX_DEGREES)) / norm.ppf(TAIL)  # S is known from few recordings
+    covariance = covariance * float(wider) ** 2 / np.outer(ratio * over, ratio * over)
+    return Explanation(tuple(cause.name for cause in causes), log_odds, np.log(ratio), covariance)

@@ -9,12 +9,12 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError
+from servoscope.core.verdict import FALSE_ALARMS, evidence_limit
 from servoscope.sums.healthy import CHANGE_STD, Healthy
 from servoscope.sums.records import Equations, Sums
 from servoscope.sums.scatter import PRIOR_DOF, block_noise, floor_variance, random_effect
-from servoscope.sums.verdict import judge
+from servoscope.sums.verdict import sums_evidence
 
-ALPHA = 0.01  # share of healthy recordings whose evidence may exceed the limit
 STRETCH_S = 15.0  # over which coefficients are compared within a recording
 CHUNKS = 2, 4, 8  # blocks, over which errors may hang together
 MAX_SQUARE = 25.0  # of a standardised score, for the inflation
@@ -23,8 +23,8 @@ SLOPE = 0.3  # by how much a standard deviation of a covariate may move a coeffi
 MIN_LEFT_OUT = 3
 
 
-def learn(equations: Equations, sums: Sequence[Sums], alpha: float = ALPHA) -> Healthy:
-    """Learn what healthy recordings look like, given their sums.
+def learn(equations: Equations, sums: Sequence[Sums], false_alarms: float = FALSE_ALARMS) -> Healthy:
+    """Learn what healthy recordings look like, given their sums; so large a share of them may be called suspect.
 
     Raises
     ------
@@ -38,20 +38,8 @@ def learn(equations: Equations, sums: Sequence[Sums], alpha: float = ALPHA) -> H
     if len(sums) >= MIN_LEFT_OUT:
         for i, recording in enumerate(sums):
             others = _fitted(equations, [*sums[:i], *sums[i + 1 :]], healthy.unit)
-            scores.append(judge(others, recording).evidence)
-    return replace(healthy, left_out=tuple(scores), limit=predictive_limit(scores, alpha))
-
-
-def predictive_limit(scores: Sequence[float], alpha: float) -> float:
-    """Return the evidence that a healthy recording exceeds with the probability alpha.
-
-    By the model that is log(1/alpha). Whatever the distribution, it exceeds the largest of n recordings that were left
-    out with the probability 1/(n + 1); beyond that, the tail is the model's.
-    """
-    usual, n = float(np.log(1.0 / alpha)), len(scores)
-    if n < MIN_LEFT_OUT:
-        return usual
-    return max(usual, max(scores) + max(float(np.log(1.0 / (alpha * (n + 1)))), 0.0))
+            scores.append(sums_evidence(others, recording).nats)
+    return replace(healthy, left_out=tuple(scores), limit=evidence_limit(scores, false_alarms))
 
 
 def _fitted(equations: Equations, sums: Sequence[Sums], unit: FloatArray | None = None) -> Healthy:

@@ -1,4 +1,4 @@
-"""Sums of a recording, what a set of equations offers, and what a recording is found to show."""
+"""Sums of a recording, and what a set of equations offers."""
 
 from __future__ import annotations
 
@@ -9,9 +9,6 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.signals import Recording
-
-Times = tuple[float, float, float]
-"""Lower limit, likeliest value and upper limit of a time [s]."""
 
 
 class Sums(NamedTuple):
@@ -59,51 +56,3 @@ class Equations(Protocol):
 
     def sums(self, recording: Recording) -> Sums:
         """Return the sums of a recording."""
-
-
-class Ratio(NamedTuple):
-    """A cause of a change and its size: the ratio of its parameter to the healthy one, with its 95 % interval."""
-
-    cause: str
-    ratio: float
-    low: float
-    high: float
-
-
-class Explanation(NamedTuple):
-    """Causes that explain a change, and other sets of causes that move the same coefficients."""
-
-    ratios: tuple[Ratio, ...]  # none: a change that no known cause explains
-    probability: float
-    log_odds: float  # against no change of this stretch [nats]
-    alike: tuple[tuple[Ratio, ...], ...] = ()  # no recording distinguishes them from `ratios`
-
-    @property
-    def causes(self) -> frozenset[str]:
-        """Names of the causes."""
-        return frozenset(ratio.cause for ratio in self.ratios)
-
-
-class Segment(NamedTuple):
-    """A stretch of a recording with constant coefficients."""
-
-    begin_s: Times
-    end_s: Times
-    changed: bool  # whether its coefficients are not the healthy ones
-    theta: FloatArray  # coefficients, shape (p,)
-    covariance: FloatArray  # shape (p, p)
-    healthy: FloatArray  # coefficients that this recording would have if it were healthy, shape (p,)
-    explanations: tuple[Explanation, ...] = ()  # the likeliest first; none of a healthy stretch
-
-
-class Verdict(NamedTuple):
-    """What a recording shows."""
-
-    evidence: float  # logarithm of the Bayes factor of a change over none [nats]
-    limit: float  # that one healthy recording in so many exceeds, as `learn` was told
-    segments: tuple[Segment, ...]  # in order of time
-
-    @property
-    def is_changed(self) -> bool:
-        """Whether the evidence is above its limit."""
-        return self.evidence > self.limit

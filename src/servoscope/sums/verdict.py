@@ -8,11 +8,15 @@ from typing import NamedTuple
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
+from servoscope.core.verdict import Explanation, JudgeEvidence, Segment, Verdict, decide
 from servoscope.sums.evidence import ChangePrior, evidence, posterior
 from servoscope.sums.explanation import explanations
 from servoscope.sums.healthy import CHANGE_COST, Healthy
 from servoscope.sums.partition import Stretch, partition, running_sums
-from servoscope.sums.records import Explanation, Segment, Sums, Times, Verdict
+from servoscope.sums.records import Sums
+
+Times = tuple[float, float, float]
+"""Lower limit, likeliest value and upper limit of a time [s]."""
 
 CUT_COST = 8.0  # nats that a time of change has to gain
 MIN_S = 3.0  # shortest stretch [s]
@@ -100,7 +104,7 @@ class _Judgement:
             if part.changed:
                 degrees = self.healthy.degrees if alone else np.inf
                 causes = explanations(self.healthy, self.mean + B, M, w, S, degrees)
-            segments.append(Segment(begin, end, part.changed, self.mean + B + moved, covariance, self.mean + B, causes))
+            segments.append(Segment(begin, end, part.changed, B + moved, covariance, causes))
         return tuple(segments)
 
     def _dates(self, stretches: tuple[Stretch, ...], B: FloatArray) -> list[Times]:
@@ -128,10 +132,15 @@ class _Judgement:
 
 def judge(healthy: Healthy, sums: Sums) -> Verdict:
     """Return whether a recording is healthy; if not, which coefficients changed, when, by how much, and why."""
+    return decide(sums_evidence(healthy, sums), healthy.limit, len(healthy.left_out))
+
+
+def sums_evidence(healthy: Healthy, sums: Sums) -> JudgeEvidence:
+    """Return the evidence of a recording; one above the limit has segments of its changes, another one as a whole."""
     judgement = _Judgement(healthy, sums)
     account = judgement.with_changes()
     # the limit stands for the odds of a change; of those of its time, only the choice among blocks is paid for
     odds = CHANGE_COST + (CUT_COST - float(np.log(judgement.blocks)) if len(account.stretches) > 1 else 0.0)
-    total = account.evidence - judgement.without_change() + odds
-    stretches = account.stretches if total > healthy.limit else (Stretch(0, judgement.blocks, False),)
-    return Verdict(total, healthy.limit, judgement.segments(stretches))
+    nats = account.evidence - judgement.without_change() + odds
+    stretches = account.stretches if nats > healthy.limit else (Stretch(0, judgement.blocks, False),)
+    return JudgeEvidence("sums", nats, judgement.segments(stretches), len(stretches) > 1)
