@@ -10,7 +10,7 @@ CODE := src tests benchmarks scripts
 TYPES := $(BIN)/python -m mypy --strict src
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all lint style format figures pictures docs sbom clean
+.PHONY: help install demo test test-all test-processor lint style format figures pictures docs sbom clean
 .DELETE_ON_ERROR:
 
 help:           ## list the targets
@@ -33,6 +33,11 @@ test test-all:
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(SELECTION); tests=$$?; \
 	if [ $$tests = 1 ] && [ -n "$(AGAIN)" ]; then $(BIN)/python -m pytest -n 0 $(AGAIN); tests=$$?; fi; \
 	wait $$types; types=$$?; echo '$(TYPES)'; cat .cache/types.log; exit $$((tests || types))
+
+# diagnoses must not hang on the last bits, which differ from one processor to the next
+NUMERICAL := tests/isolation tests/detection tests/diagnosis/test_last_bits.py tests/learning/test_likelihood.py tests/learning/test_learning.py
+test-processor: $(STAMP)  ## the numerical tests with the arithmetic of another processor
+	$(BIN)/python scripts/other_processor.py $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow" $(NUMERICAL)
 
 lint: style     ## format and lint of the whole tree, and types, without changing a file
 	$(TYPES)

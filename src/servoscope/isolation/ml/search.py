@@ -24,7 +24,7 @@ from servoscope.isolation.ml.hypothesis import (
 )
 from servoscope.isolation.ml.onset import OnsetEstimate, onset_posterior
 from servoscope.isolation.ml.result import Hypothesis, RefitResult
-from servoscope.isolation.ml.start_values import SizeGrid, choose_start, fit_further_parameters, pair_start_values
+from servoscope.isolation.ml.start_values import SearchStart, begin_searches, fit_further_parameters, pair_start_values
 from servoscope.isolation.ml.window import ChangeProfile, ChangeWindow, RefitWindow
 from servoscope.models.plants import Fault
 from servoscope.signals import Recording
@@ -208,29 +208,34 @@ class _HypothesisSearch:
         The recursion's onset may be far off where a fault moves its coefficients along a curve, as oil does; the alarm
         is never far behind. Sizes that fit a wrong onset may be stuck: a grid over all sizes is searched each time.
         """
-        d, grids, begin = choose_start(self.window, self.faults, d, {self.initial_onset, self.latest})
-        singles = self._fit_each_fault(ChangeProfile(begin), d, grids)
+        searches = begin_searches(self.window, self.faults, d)
+        onsets = {self.initial_onset, self.latest} | ({0} if self.window.follows else set())
+        # a grid that holds the healthy parameters costs the same at every onset where a size of none is its lowest
+        at_onsets = [self._fit_each_fault(ChangeProfile(onset), searches) for onset in sorted(onsets)]
+        singles = min(at_onsets, key=lambda fitted: min(f.cost for f in fitted))
+        self.profile = singles[0].profile
         for drifts in (False, True):
             for _ in range(MAX_LOOKS):
                 best = self._update_noise_variance(singles)
                 estimate = self._onset(best, drifts)
                 if estimate.profile == self.profile:
                     break
-                singles = self._fit_each_fault(estimate.profile, d, grids, singles)
+                singles = self._fit_each_fault(estimate.profile, searches, singles)
                 gained = best.cost - self._update_noise_variance(singles).cost
                 if gained < MIN_LOOK_GAIN * self.noise_variance:
                     break
         return estimate, singles
 
     def _fit_each_fault(
-        self, profile: ChangeProfile, d: FloatArray, grids: Sequence[SizeGrid], known: Sequence[HypothesisFit] = ()
+        self, profile: ChangeProfile, searches: Sequence[SearchStart], known: Sequence[HypothesisFit] = ()
     ) -> list[HypothesisFit]:
-        """Fit every fault alone, from the local minima of its grid and from a known size."""
-        self.profile = profile
-        starts = [grid.local_minima(self.window, profile) for grid in grids]
-        for start, other in zip(starts, known, strict=False):
-            start.append(other.x)
-        return [self._fit([fault], d, start) for fault, start in zip(self.faults, starts, strict=True)]
+        """Fit every fault alone, from the local minima of its grids, and from where it was found before."""
+        self.profile, singles = profile, []
+        for i, fault in enumerate(self.faults):
+            begun = [self._fit([fault], d, grids[i].local_minima(self.window, profile)) for d, grids in searches]
+            begun += [self._refit_at(before, profile) for before in known[i : i + 1]]
+            singles.append(min(begun, key=lambda fitted: fitted.cost))
+        return singles
 
     def _fit(self, faults: Sequence[Fault], d: FloatArray, starts: Sequence[FloatArray]) -> HypothesisFit:
         self.progress()

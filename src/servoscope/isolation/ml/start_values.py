@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import Any, Self
 
 import numpy as np
@@ -53,24 +52,17 @@ class SizeGrid:
         return [self.sizes[at] for at in _local_minima(self.sums_of_squares(window, profile))]
 
 
-def choose_start(
-    window: ChangeWindow, faults: Sequence[Fault], d: FloatArray, onsets: Collection[int]
-) -> tuple[FloatArray, list[SizeGrid], int]:
-    """Return healthy parameters, a grid per fault, and an onset: where all of them together cost least.
+SearchStart = tuple[FloatArray, list[SizeGrid]]
+"""Healthy parameters at which searches begin, and a grid per fault."""
+
+
+def begin_searches(window: ChangeWindow, faults: Sequence[Fault], d: FloatArray) -> list[SearchStart]:
+    """Return healthy parameters at which searches begin, each with a grid per fault.
 
     Healthy parameters that follow may have taken over a fault that was there from the first sample on.
     """
-    healthy = [d]
-    if window.follows:
-        healthy, onsets = [d, np.zeros_like(d)], {0, *onsets}
-    starts = [(z, [SizeGrid.from_window(window, fault, z) for fault in faults]) for z in healthy]
-
-    def cost(start: tuple[FloatArray, list[SizeGrid]], onset: int) -> float:
-        prior, profile = window.prior @ start[0], ChangeProfile(onset)
-        return float(min(grid.sums_of_squares(window, profile).min() for grid in start[1]) + prior @ prior)
-
-    (d, grids), begin = min(product(starts, sorted(onsets)), key=lambda choice: cost(*choice))
-    return d, grids, begin
+    healthy = [d, np.zeros_like(d)] if window.follows else [d]
+    return [(z, [SizeGrid.from_window(window, fault, z) for fault in faults]) for z in healthy]
 
 
 def pair_start_values(window: ChangeWindow, faults: Sequence[Fault], profile: ChangeProfile) -> list[FloatArray]:
