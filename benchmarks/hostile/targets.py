@@ -106,7 +106,7 @@ def _files(folder: Path, recording: Recording) -> list[Target]:
     columns = {name: np.asarray(getattr(recording, name)) for name in "truy"}
     made = {"CSV": "csv", "Parquet": "parquet", "MAT 5": "mat", "MAT 7.3": "mat", "MDF": "mf4", "TDMS": "tdms"}
     made |= {"HDF5": "h5", "Excel": "xlsx", "LVM": "lvm", "MCAP": "mcap", "ULog": "ulg", "gzip": "csv.gz", "ZIP": "zip"}
-    made |= {"JSON": "jsonl", "Feather": "feather", "NumPy": "npz", "SQLite": "db"}
+    made |= {"JSON": "jsonl", "Feather": "feather", "NumPy": "npz", "SQLite": "db", "trace": "trace"}
     writing: dict[str, Callable[[Path], object]] = {
         "MAT 5": lambda path: _mat(path, columns),
         "MAT 7.3": lambda path: _hdf5(path, columns),
@@ -117,6 +117,7 @@ def _files(folder: Path, recording: Recording) -> list[Target]:
         "LVM": lambda path: path.write_text(_lvm(columns)),
         "MCAP": lambda path: _mcap(path, columns),
         "ULog": lambda path: path.write_bytes(_ulog(columns)),
+        "trace": lambda path: path.write_text(_trace(columns)),
         "gzip": lambda path: path.write_bytes(gzip.compress(_text(columns).encode())),
         "ZIP": lambda path: _zip(path, columns),
         "JSON": lambda path: path.write_text(_records(columns)),
@@ -216,6 +217,14 @@ def _sheet(path: Path, columns: dict[str, Any]) -> None:
         for k, name in enumerate("truy"):
             sheet.write(0, k, name)
             sheet.write_column(1, k, columns[name])
+
+
+def _trace(columns: dict[str, Any]) -> str:
+    lines = ["[key]; [value]"]
+    for number, name in enumerate("ruy"):
+        lines += [f"{number}.Variable; {name}", f"{number}.Data; "]
+        lines += [f"; {1e3 * t:g}; {x:g}" for t, x in zip(columns["t"], columns[name], strict=True)]
+    return "\n".join(lines)
 
 
 def _lvm(columns: dict[str, Any]) -> str:

@@ -249,8 +249,8 @@ def test_parquet_with_time_stamps(tmp_path: Path, unit: str) -> None:
     as_expected(read(parquet(tmp_path, signals() | {"t": stamps})))
 
 
-def test_parquet_with_lists_is_refused(tmp_path: Path) -> None:
-    assert "not numbers" in refusal(parquet(tmp_path, signals() | {"u": [[1.0]] * 300}))
+def test_a_column_with_lists_is_taken_by_its_elements(tmp_path: Path) -> None:
+    assert "did you mean u[0]" in refusal(parquet(tmp_path, signals() | {"u": [[1.0]] * 300}))
 
 
 def test_parquet_with_times_for_numbers_is_refused(tmp_path: Path) -> None:

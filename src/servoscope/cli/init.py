@@ -49,7 +49,7 @@ def init(
     from servoscope.cli.render import results
     from servoscope.learning.proposal import PART_ROWS, propose_columns
     from servoscope.signals import readers
-    from servoscope.signals.readers.axes import find_axes
+    from servoscope.signals.readers.axes import find_axes, moving_axes
     from servoscope.signals.readers.table import read_part
 
     log, asks = logs[0], not yes and sys.stdin.isatty() and sys.stdout.isatty()
@@ -61,13 +61,17 @@ def init(
     if asks and reading.columns is None:
         results.print_channels(out, log, channels, reading.rate)
     axes = [reading.axis] if reading.axis is not None or reading.columns is not None else []
-    axes = axes or [*find_axes([channel.name for channel in channels])] or [None]
-    targets = [_axis_file(output, axis) if len(axes) > 1 else output for axis in axes]
+    several = [] if axes else [*find_axes([channel.name for channel in channels])]
+    moving = [*moving_axes(channels)] if several else []
+    axes = axes or list[str | None](moving) or [None]
+    targets = [_axis_file(output, axis) if len(axes) > 1 or moving else output for axis in axes]
     for target in targets:
         if target.exists() and not yes:
             raise OutputError(f"{target}: exists; name another file with -o, or replace it with --yes")
-    if len(axes) > 1:
-        results.print_notes(out, [say("init.axes", axes=[str(axis) for axis in axes])])
+    if several:
+        results.print_notes(out, [say("init.axes", axes=moving)] if moving else [])
+        if resting := [axis for axis in several if axis not in moving]:
+            results.print_notes(out, [say("init.axes_at_rest", axes=resting)])
     failures = FailureCounter()
     for axis, target in zip(axes, targets, strict=True):
         with failures.catch():

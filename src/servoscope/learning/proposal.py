@@ -25,7 +25,7 @@ from servoscope.models.loop import Columns, Loop, MonitorSettings
 from servoscope.models.plants import plant_class
 from servoscope.signals import Recording
 from servoscope.signals.readers import ChannelInfo, list_channels, read
-from servoscope.signals.readers.axes import find_axes, signal_names
+from servoscope.signals.readers.axes import find_axes, signal_names, signals_of_one_axis
 from servoscope.signals.readers.columns import LinearCombination, header_hint, parse_combination, parse_fields
 from servoscope.signals.readers.formats import open_file
 from servoscope.signals.readers.guess_columns import (
@@ -107,17 +107,17 @@ def propose_columns(
     guessed. Raises RecordingError if no name suggests u or y, or the file has no such axis, LoopError if `given` cannot
     be read.
     """
-    names = signal_names(channels)
-    axes = find_axes(names)
     if axis is not None:
+        axes = find_axes([channel.name for channel in channels])
         if axis not in axes:
             has = f"it has {', '.join(axes)}" if axes else "its names show one axis; name the columns with --columns"
             raise RecordingError(f"{path}: no axis {axis!r}, {has}")
-        names = axes[axis]
+        channels = [channel for channel in channels if channel.name in axes[axis]]
     told = parse_fields(given) if given else {}
     texts = [str(text) for value in told.values() for text in (value if isinstance(value, tuple) else (value,))]
     # a column that the user names is no other signal
     used = {*texts, *(word for text in texts for pair in re.findall(r"`([^`]+)`|([\w.]+)", text) for word in pair)}
+    names = signal_names(channels) if axis is not None else signals_of_one_axis(channels, used)
     fields = {**guess_mapping([name for name in names if name not in used]), **told}
     missing = [letter for letter in "uy" if fields[FIELDS[letter]] is None]
     if missing:

@@ -33,11 +33,11 @@ def simulation_summary(recording: Recording, truth: Truth, columns: Columns) -> 
 
 def channels_summary(name: str, channels: Sequence[ChannelInfo]) -> dict[str, object]:
     """Return the columns of a file, and which of them might be t, r, u and y."""
-    from servoscope.signals.readers.axes import signal_names
+    from servoscope.signals.readers.axes import signals_of_one_axis
     from servoscope.signals.readers.guess_columns import guess_columns
 
     listed = [replace_nan({"name": c.name, "type": c.dtype, "min": c.min, "max": c.max}) for c in channels]
-    return {"recording": name, "channels": listed, "proposed": guess_columns(signal_names(channels))}
+    return {"recording": name, "channels": listed, "proposed": guess_columns(signals_of_one_axis(channels))}
 
 
 def baseline_summary(b: Baseline) -> dict[str, object]:

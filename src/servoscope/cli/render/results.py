@@ -217,14 +217,16 @@ def print_channels(out: Console, path: Path, channels: Sequence[ChannelInfo], ra
 
     `rate`: that of the rows, where the user says it [Hz].
     """
-    from servoscope.signals.readers.axes import signal_names
+    from servoscope.signals.readers.axes import moving_axes, signals_of_one_axis
     from servoscope.signals.readers.guess_columns import format_mapping, guess_mapping
 
     print_title(out, path.name, f": {say('cli.columns', count=len(channels))}")
     limits = [[f"{x:.6g}" if math.isfinite(x) else DASH for x in (c.min, c.max)] for c in channels]
     rows = [(c.name, c.dtype, *limit) for c, limit in zip(channels, limits, strict=True)]
     print_table(out, ("column", "type", "smallest", "largest"), rows, words=2)
-    fields = guess_mapping(signal_names(channels))
+    fields = guess_mapping(signals_of_one_axis(channels))
+    if axes := moving_axes(channels):
+        print_notes(out, [say("cli.axes", axes=[*axes])])
     if mapping := format_mapping(fields):
         print_notes(out, [say("cli.proposed_mapping", mapping=mapping)])
     missing = [letter for letter, field in (("u", "input"), ("y", "output")) if fields[field] is None]

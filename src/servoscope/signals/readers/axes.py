@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from servoscope.signals.readers.guess_columns import guess_columns
 from servoscope.signals.readers.recording_file import ChannelInfo
@@ -13,6 +13,7 @@ from servoscope.signals.readers.recording_file import ChannelInfo
 # what tells axes apart in names: a number, or a letter that stands alone or ends a word as in AxisX
 MARK = re.compile(r"\d+|(?<![A-Za-z0-9])[XYZABCxyzabc](?![A-Za-z0-9])|(?<=[a-z])[XYZABC](?![A-Za-z])")
 
+MAX_AXES = 32  # numbers in more names than that count something else, samples for example
 # the largest over the smallest value, below which a positive column is a supply rather than a signal
 MAX_SUPPLY_RATIO = 2.0
 
@@ -62,4 +63,28 @@ def find_axes(names: Sequence[str]) -> dict[str, list[str]]:
         found_columns = guess_columns(columns)
         if all(found_columns.get(letter) in mine for letter in "uy"):
             axes[mark] = columns
-    return axes if len(axes) > 1 else {}
+    return axes if 1 < len(axes) <= MAX_AXES else {}
+
+
+def moving_axes(channels: Sequence[ChannelInfo]) -> dict[str, list[str]]:
+    """Return the signals of each axis that moves; of one at rest the input, the output or the reference is constant."""
+    by_name = {channel.name: channel for channel in channels}
+    moving = {}
+    for axis, names in find_axes(list(by_name)).items():
+        guessed = guess_columns(names)
+        if all(by_name[guessed[letter]].min < by_name[guessed[letter]].max for letter in "ruy" if letter in guessed):
+            moving[axis] = signal_names([by_name[name] for name in names])
+    return moving
+
+
+def signals_of_one_axis(channels: Sequence[ChannelInfo], used: Collection[str] = ()) -> list[str]:
+    """Return the signals among which t, r, u and y are guessed: all, or those of one axis of several.
+
+    That is the axis of the columns that are `used`, else the first that moves.
+    """
+    axes = find_axes([channel.name for channel in channels])
+    common = set.intersection(*map(set, axes.values())) if axes else set()
+    for names in axes.values():
+        if ({*names} - common) & {*used}:
+            return signal_names([channel for channel in channels if channel.name in names])
+    return next(iter(moving_axes(channels).values()), None) or signal_names(channels)

@@ -72,6 +72,7 @@ BUILT_IN = {
         (".json .jsonl .ndjson", "JSON", "records", "open_json", "", "", True),
         (".feather .arrow .ipc", "Feather", "records", "open_feather", "", "", True),
         (".npz .npy", "NumPy", "records", "open_numpy", "", "", True),
+        (".trace", "trace", "traces", "open_trace"),
         (".db .sqlite .sqlite3 .db3", "SQLite", "records", "open_sqlite", "", "", True),
     )
     for suffix in suffixes.split()
@@ -97,6 +98,7 @@ MAGIC = {
     b"ARROW1": "Feather",
     b"\x93NUMPY": "NumPy",
     b"SQLite format 3": "SQLite",
+    b"[key]": "trace",
     b"#ROSBAG V": "bag of ROS 1",
 }
 COMPATIBLE_KINDS = {
@@ -148,6 +150,8 @@ def _open_plain(path: Path, text: TextLayout | None) -> TableFile:
     reader = BUILT_IN.get(suffix)
     if reader is not None and reader.format == "CSV" and head.lstrip()[:1] == b"{" and b"}" in head:
         reader = BUILT_IN[".json"]  # many programs write records as lines of a log
+    if reader is not None and reader.format == "CSV" and _recognise(head.lstrip(b"\xef\xbb\xbf")) == "trace":
+        reader = BUILT_IN[".trace"]
     if reader is not None:
         _check_format(path, head, reader.format)
         opened = reader.open(path, text)

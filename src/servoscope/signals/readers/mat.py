@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.errors import RecordingError
+from servoscope.signals.readers.matrices import split_matrices
 from servoscope.signals.readers.table import TableFile, one_line_errors
 from servoscope.signals.readers.units import split_unit, with_unit
 
@@ -31,7 +32,7 @@ def open_hdf5(path: Path) -> TableFile:
 def _open_variables(path: Path, kind: str, load: Callable[[Path], Mapping[str, Any]]) -> TableFile:
     """Open a file whose variables are read at once."""
     with one_line_errors(path, f"is a damaged or unknown {kind} file", "save it again"):
-        variables = dict(_flatten(load(path)))
+        variables = split_matrices(dict(_flatten(load(path))))
     lengths = [x.size for x in variables.values() if x.size > 1]
     # The channels are the vectors of the length that most of them, and of those the longest, have.
     rows = max(lengths, key=lambda size: (lengths.count(size), size), default=0)
@@ -147,7 +148,7 @@ def _frame_columns(node: dict[str, Any]) -> dict[str, Any]:
 
 
 def _flatten(variables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, npt.NDArray[Any]]]:
-    """Walk variables and structs, ``motor.speed``; the columns of a matrix become ``x[0]``, ``x[1]``."""
+    """Walk variables and structs, ``motor.speed``; matrices are whole yet."""
     for key, value in variables.items():
         name = f"{prefix}{key}"
         array = value if isinstance(value, Mapping) else np.asarray(value)
@@ -170,11 +171,7 @@ def _flatten(variables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[s
             yield name, np.asarray(since * 1e-9, dtype=np.float64)
         elif array.dtype.kind in "fiub" and array.ndim <= 2:
             plain = array.astype(array.dtype.newbyteorder("="))
-            if plain.ndim < 2 or 1 in plain.shape:
-                yield name, np.ascontiguousarray(plain.reshape(-1))
-            else:
-                for index in range(plain.shape[1]):
-                    yield f"{name}[{index}]", np.ascontiguousarray(plain[:, index])
+            yield name, np.ascontiguousarray(plain.reshape(-1) if plain.ndim < 2 or 1 in plain.shape else plain)
 
 
 def _control_desk_channels(records: npt.NDArray[Any], name: str) -> Iterator[tuple[str, npt.NDArray[Any]]]:

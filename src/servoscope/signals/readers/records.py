@@ -16,10 +16,9 @@ import pyarrow as pa
 import pyarrow.feather as pf
 import pyarrow.json as pj
 
+from servoscope.signals.readers.matrices import MAX_ARRAY_LENGTH, flatten_table, split_matrices
 from servoscope.signals.readers.table import CHUNK_ROWS, TableFile, check_width, one_line_errors
-from servoscope.signals.readers.topics import MAX_ARRAY_LENGTH, open_bag
-
-MAX_DEPTH = 6  # of records within records
+from servoscope.signals.readers.topics import open_bag
 
 
 def open_json(path: Path) -> TableFile:
@@ -56,7 +55,7 @@ def open_numpy(path: Path) -> TableFile:
     with one_line_errors(path, "holds no plain arrays", "save columns of numbers"), path.open("rb") as file:
         loaded = np.load(file, allow_pickle=False)
         arrays = {"": loaded} if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
-    columns = dict(pair for name, array in arrays.items() for pair in _array_columns(name, array))
+    columns = split_matrices(dict(pair for name, array in arrays.items() for pair in _plain_arrays(name, array)))
     length = max(
         Counter(x.size for x in columns.values()).items(), key=lambda pair: (pair[1], pair[0]), default=(0, 0)
     )[0]
@@ -64,14 +63,16 @@ def open_numpy(path: Path) -> TableFile:
     return _open_frame(path, pa.table({name: x for name, x in columns.items() if name not in others}), others)
 
 
-def _array_columns(name: str, array: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the columns of an array, named after their fields or numbers."""
+def _plain_arrays(name: str, array: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the vectors and matrices of an array, those of records by the names of their fields."""
     if array.dtype.names:
-        yield from ((f"{name}.{field}".lstrip("."), array[field].ravel()) for field in array.dtype.names)
-    elif array.ndim == 2 and 1 < array.shape[1] <= MAX_ARRAY_LENGTH:
-        yield from ((f"{name}[{k}]" if name else f"c{k}", array[:, k].copy()) for k in range(array.shape[1]))
-    elif array.dtype.kind in "fiubMm" and array.size == max(array.shape, default=0):
-        yield name or "c0", array.ravel()
+        for field in array.dtype.names:
+            yield from _plain_arrays(f"{name}.{field}".lstrip("."), array[field])
+    elif array.size == max(array.shape, default=0):
+        if array.dtype.kind in "fiubMm":
+            yield name, array.ravel()
+    elif array.ndim == 2 and array.dtype.kind in "fiub" and 1 < min(array.shape) <= MAX_ARRAY_LENGTH:
+        yield name, array
 
 
 def open_sqlite(path: Path) -> TableFile:
@@ -125,20 +126,7 @@ def _cell_column(cells: Sequence[Any]) -> Any:
 
 
 def _open_frame(path: Path, table: Any, others: Mapping[str, str] | None = None) -> TableFile:
-    """Return a table of Arrow, records and short lists in its cells flattened."""
-    for _ in range(MAX_DEPTH):
-        table = table.flatten()
-    columns: dict[str, Any] = {}
-    for name in table.column_names:
-        column = table.column(name)
-        if pa.types.is_list(column.type) or pa.types.is_large_list(column.type):
-            width = max((len(cell) for cell in column.slice(0, 1).to_pylist() if cell), default=0)
-            if 0 < width <= MAX_ARRAY_LENGTH:
-                cells = [
-                    cell if cell is not None and len(cell) == width else [None] * width for cell in column.to_pylist()
-                ]
-                columns |= {f"{name}[{k}]": pa.array([c[k] for c in cells]) for k in range(width)}
-        else:
-            columns[name] = column
+    """Return a table of Arrow, records and lists in its cells flattened."""
+    columns = flatten_table(table)
     check_width(path, len(columns))
     return TableFile.from_columns(path, columns, non_channels=dict(others or {}))

@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.core.errors import RecordingError
+from servoscope.signals.readers.matrices import MAX_ARRAY_LENGTH
 from servoscope.signals.readers.table import TableFile, check_width, one_line_errors
 
 MAX_VALUES = 200_000_000  # of all topics together, which are held in memory
-MAX_ARRAY_LENGTH = 64  # values of one field, such as the joints of a robot; images and scans have more
 
 Topics = Mapping[str, Mapping[str, npt.NDArray[Any]]]
 

@@ -68,6 +68,7 @@ OTHER_UNITS = (
 )
 FACTORS = {**LENGTHS, **ANGLES, **SPEEDS, **INPUTS}
 BRACKETED_UNIT = re.compile(r"^(.*?)\s*(?:\[\s*([^\[\]]+?)\s*\]|\(\s*([^()]+?)\s*\))\s*$")
+INDEXED = re.compile(r"\w\[\d+\]$")  # an element of an array, q[1], is no quantity without a unit, q [1]
 QUANTITY = re.compile(r"([-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s].*)")  # 12.5 mm
 BARE_UNIT = re.compile(r"^(.+?)(?:[_ ]|\s*/\s*)([A-Za-zµμ°%/]{1,5})$")  # a unit without brackets: pos_mm, t/ms
 
@@ -95,7 +96,7 @@ def split_unit(name: str) -> tuple[str, str]:
     """Return a column's name without its unit, and the unit; empty where it has none that is known."""
     match = BRACKETED_UNIT.match(name)
     if match is not None and is_unit(unit := match[2] or match[3]):
-        return match[1], unit
+        return (name, "") if INDEXED.search(name) else (match[1], unit)
     loose = BARE_UNIT.match(name)
     # a single letter is a name more often than a unit: joint_A, r_m
     if loose is not None and is_unit(loose[2]) and (len(loose[2]) > 1 or loose[2] in "s°%"):

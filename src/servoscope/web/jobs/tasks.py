@@ -38,7 +38,7 @@ from servoscope.report.downsample import downsample_indices, json_numbers, signa
 from servoscope.service.renewal import read_stretch
 from servoscope.signals import Recording, readers
 from servoscope.signals.readers.arm_log import read_arm_log
-from servoscope.signals.readers.axes import find_axes, signal_names
+from servoscope.signals.readers.axes import moving_axes, signals_of_one_axis
 from servoscope.signals.readers.formats import open_file
 from servoscope.signals.readers.guess_columns import guess_mapping
 from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD
@@ -66,13 +66,13 @@ def preview_file(progress: Progress, file: str) -> JsonObject:
         first = first if first is not None else table
     assert first is not None, "a file without rows was refused"
     head = [[_preview_cell(x) for x in first.columns[name].slice(0, most).to_pylist()] for name in names]
-    signals = signal_names(listed)
+    signals = signals_of_one_axis(listed)
     return {
         "rows": count,
         "columns": channels,
         "preview": {"columns": names, "rows": list(zip(*head, strict=True))},
         "mapping": guess_mapping(signals),
-        "axes": {axis: guess_mapping(columns) for axis, columns in find_axes(signals).items()},
+        "axes": {axis: guess_mapping(columns) for axis, columns in moving_axes(listed).items()},
     }
 
 
