@@ -6,7 +6,8 @@ import math
 import time
 from collections.abc import Mapping
 
-from servoscope.core.errors import AlarmError, StoreUnavailableError
+from servoscope.core.errors import AlarmError, ServoscopeError, StoreUnavailableError
+from servoscope.core.messages import message, render
 from servoscope.service.alarms import LifecycleEvent, OperatorCommand
 from servoscope.service.assets.records import StepResult, audit_row
 from servoscope.service.assets.status import Announcement
@@ -16,7 +17,7 @@ from servoscope.service.metrics import ServiceMetrics
 from servoscope.service.parts import ServiceParts
 from servoscope.service.sources.message import RejectionCounter
 from servoscope.service.store import CommandOutcome, Row, Store
-from servoscope.service.store.rows import BASELINE_NOTE, CONFIRMATION, NOTE, RELEARN, TEST
+from servoscope.service.store.rows import BASELINE_NOTE, BEGUN, CONFIRMATION, NOTE, RELEARN, TEST
 from servoscope.service.store.series import read_new_notes, thin_sizes
 
 DAY_S = 86400.0
@@ -113,39 +114,49 @@ class Housekeeping:
                 self._service.assets[name].announce(announced)
 
     def _execute_commands(self) -> None:
-        pending = self._service.store.pending_commands()
+        service = self._service
+        pending = service.store.pending_commands()
         self._executed &= {row["id"] for row in pending}
-        for row in pending:
-            if row["id"] not in self._executed:
-                self._executed.add(row["id"])
-                self._execute_command(row)
+        own = {*service.assets, service.notifier.name}  # others belong to another service on the same store
+        new = [row for row in pending if row["id"] not in self._executed and row["asset"] in own]
+        if begun := [row for row in new if row["command"] != RELEARN and BEGUN not in row["document"]]:
+            service.store.begin_commands(begun)
+        for row in new:
+            self._executed.add(row["id"])
+            self._execute_command(row)
 
     def _execute_command(self, row: Row) -> None:
-        service, name, document = self._service, row["asset"], row["document"]
-        asset, notifier = service.assets.get(name), service.notifier
-        if asset is None and name != notifier.name:
-            return  # it belongs to another service on the same store
+        service, name = self._service, row["asset"]
         if row["command"] == RELEARN:  # the audit has it already
             service.reload(service.config.file)
             service.writer.batch.outcomes[row["id"]] = {"outcome": CommandOutcome(accepted=True).text}
             return
-        now = service.clock.now() if asset is None or asset.state is None else asset.state.position.t
-        until = now + document["for_s"] if document.get("for_s") is not None else None
-        outcome = CommandOutcome(accepted=True)
         try:
-            if row["command"] == TEST:
-                service.writer.add(name, notifier.try_sink(row["alarm"], row["who"], now))
-            elif asset is not None:
-                service.handle_result(asset, asset.execute(row["alarm"], _operator_command(row, until)))
-                service.writer.set_checkpoint(asset)
-            else:
-                self._handle_own(notifier.execute(row["alarm"], _operator_command(row, until), now), now)
-        except AlarmError as error:
-            outcome = CommandOutcome(accepted=False, refusal=str(error))
-        document = outcome.extend(document)
+            if BEGUN in row["document"]:  # what it led to went with the process, and may have ended it
+                raise AlarmError(render(message("service.command_interrupted")))
+            self._carry_out(row)
+            outcome = CommandOutcome(accepted=True)
+        except Exception as error:  # no command ends the service
+            why = str(error) if isinstance(error, ServoscopeError) else f"{type(error).__name__}: {error}"
+            outcome = CommandOutcome(accepted=False, refusal=why)
+        document = outcome.extend(row["document"])
         service.writer.batch.outcomes[row["id"]] = {"outcome": outcome.text, "document": document}
         audit = {"alarm": row["alarm"], "asked": row["at"], **document, "outcome": outcome.text}
         service.writer.add(name, [audit_row(row["command"], audit, row["who"])])
+
+    def _carry_out(self, row: Row) -> None:
+        """Do what a command says; raises AlarmError where it has no meaning."""
+        service, name, document = self._service, row["asset"], row["document"]
+        asset, notifier = service.assets.get(name), service.notifier
+        now = service.clock.now() if asset is None or asset.state is None else asset.state.position.t
+        until = now + document["for_s"] if document.get("for_s") is not None else None
+        if row["command"] == TEST:
+            service.writer.add(name, notifier.try_sink(row["alarm"], row["who"], now))
+        elif asset is not None:
+            service.handle_result(asset, asset.execute(row["alarm"], _operator_command(row, until)))
+            service.writer.set_checkpoint(asset)
+        else:
+            self._handle_own(notifier.execute(row["alarm"], _operator_command(row, until), now), now)
 
     def _delete_old_rows(self) -> None:
         now = time.monotonic()

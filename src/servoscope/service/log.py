@@ -10,18 +10,20 @@ from datetime import UTC, datetime
 from typing import TextIO
 
 from servoscope.core.addresses import hide_secrets
+from servoscope.core.texts import clean_text
 
 LOGGER = logging.getLogger("servoscope")
+MAX_TRACE_CHARS = 20_000
 LIBRARIES = ("psycopg", "asyncua")  # they log lost connections themselves
 
 
-def _hide(value: object) -> object:
-    """Return a value as JSON takes it, without the secrets of addresses."""
+def _to_plain(value: object) -> object:
+    """Return a value as JSON takes it: texts are clean, and without the secrets of addresses."""
     if isinstance(value, Mapping):
-        return {key: _hide(item) for key, item in value.items()}
+        return {clean_text(str(key)): _to_plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_hide(item) for item in value]
-    return value if isinstance(value, bool | int | float | None) else hide_secrets(str(value))
+        return [_to_plain(item) for item in value]
+    return value if isinstance(value, bool | int | float | None) else clean_text(hide_secrets(str(value)))
 
 
 class _JsonFormatter(logging.Formatter):
@@ -32,10 +34,11 @@ class _JsonFormatter(logging.Formatter):
             "event": record.getMessage(),
             **getattr(record, "fields", {}),
         }
-        if record.exc_info:
-            entry["trace"] = self.formatException(record.exc_info)
         # libraries log addresses as they were given; JSON would escape quotes, so the values are searched first
-        return json.dumps(_hide(entry), default=str)
+        plain = {key: _to_plain(value) for key, value in entry.items()}
+        if record.exc_info:
+            plain["trace"] = clean_text(hide_secrets(self.formatException(record.exc_info)), MAX_TRACE_CHARS)
+        return json.dumps(plain, default=str)
 
 
 def set_level(level: str) -> None:

@@ -13,6 +13,7 @@ from servoscope.core.errors import StoreUnavailableError
 from servoscope.service.assets.asset import Asset
 from servoscope.service.assets.checkpoint import pack_state
 from servoscope.service.assets.records import TableRow
+from servoscope.service.log import log
 from servoscope.service.store import Batch, Store
 from servoscope.service.store.bundles import SampleBlock
 
@@ -135,7 +136,8 @@ class StoreWriter:
             return None
         try:
             if not (self._in_doubt and self._store.last_commit(self._owner) == self._number + 1):
-                self._store.write(self._sealed.batch, self._owner, self._number + 1)
+                for refused in self._store.write(self._sealed.batch, self._owner, self._number + 1):
+                    log("error", "row set aside", **refused._asdict())
         except StoreUnavailableError:
             self._in_doubt = True
             self._retry_s = min(max(2.0 * self._retry_s, MIN_RETRY_S), MAX_RETRY_S)

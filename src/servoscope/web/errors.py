@@ -15,6 +15,7 @@ from starlette.responses import JSONResponse, Response
 
 from servoscope.core.errors import AlarmError, ServoscopeError, StoreError
 from servoscope.core.messages import say
+from servoscope.core.texts import clean_text, clean_texts
 from servoscope.web.schemas.responses import JsonObject, Problem
 
 PROBLEM_TYPE = "application/problem+json"
@@ -47,8 +48,10 @@ def problem(
     status: int, detail: str, instance: str | None = None, errors: list[dict[str, str]] | None = None
 ) -> JsonObject:
     """Return a problem as plain values."""
-    title, detail = HTTPStatus(status).phrase, " ".join(detail.split())
-    document = Problem(type="about:blank", title=title, status=status, detail=detail, instance=instance, errors=errors)
+    title, detail = HTTPStatus(status).phrase, clean_text(" ".join(detail.split()))
+    document = Problem(
+        type="about:blank", title=title, status=status, detail=detail, instance=instance, errors=clean_texts(errors)
+    )
     return document.model_dump(exclude_none=True)
 
 

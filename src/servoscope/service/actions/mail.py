@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from servoscope.core.messages import message, render
+from servoscope.core.texts import clean_texts
 from servoscope.service.actions.settings import TEST_EVENT, EmailSettings
 from servoscope.service.asset_link import qr_code
 
@@ -116,6 +117,7 @@ def send_mail(
 
 def compose_mail(key: str, events: Sequence[dict[str, Any]], settings: EmailSettings) -> EmailMessage:
     """Return a mail about events, in plain text; `key` tells it from others."""
+    events = [clean_texts(event) for event in events]
     mail, first = EmailMessage(), events[0]
     subject = _subject(first) if len(events) == 1 else render(message("service.mail.several", count=len(events)))
     mail["From"], mail["To"], mail["Date"] = settings.sender, ", ".join(settings.to), formatdate()

@@ -6,6 +6,7 @@ import fcntl
 import hashlib
 import json
 import os
+import re
 import sqlite3
 import time
 from collections.abc import Iterator, Sequence
@@ -20,12 +21,16 @@ from sqlalchemy.engine import URL, make_url
 
 from servoscope.core.addresses import hide_secrets, show_address
 from servoscope.core.errors import StoreError, StoreUnavailableError
+from servoscope.core.texts import MAX_TEXT_CHARS, UNSAFE, clean_texts
 
 LOCK_TIMEOUT_S = 0.5  # s: for a locked SQLite file; samples keep coming meanwhile
 TRANSIENT_ERRORS = {  # of SQLite, where a retry may help
     sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN,
     sqlite3.SQLITE_READONLY, sqlite3.SQLITE_NOMEM, sqlite3.SQLITE_PROTOCOL,
 }  # fmt: skip
+# of PostgreSQL, classes of errors about what a row holds: cardinality, data, constraints, limits
+REFUSING_CLASSES = ("21", "22", "23", "54")
+ESCAPED_CONTROL = re.compile(r"\\(?:[bfr]|u00)")  # as JSON has them
 HINTS = {  # what to do, where SQLite does not say it
     sqlite3.SQLITE_CORRUPT: ", restore it from a copy",
     sqlite3.SQLITE_NOTADB: ", give another path",
@@ -104,10 +109,22 @@ def create_store_engine(url: URL, *, lock_timeout_s: float = LOCK_TIMEOUT_S, wri
 
 
 def encode_document(document: Any) -> str:
-    """Return a document as JSON text, in a fifth of the time that `json.dumps` takes; what is not finite is null."""
+    """Return a document as JSON text, in a fifth of the time that `json.dumps` takes; what is not finite is null.
+
+    Its texts are those of `clean_texts`: of nearly all documents the encoded bytes show that they are so already.
+    """
     import msgspec
 
-    return msgspec.json.encode(document).decode()
+    try:
+        encoded = msgspec.json.encode(document)
+    except UnicodeEncodeError:
+        return msgspec.json.encode(clean_texts(document)).decode()
+    text = encoded.decode()
+    is_long = len(text) > MAX_TEXT_CHARS and max(map(len, text.split('"'))) > MAX_TEXT_CHARS
+    is_unsafe = "\x7f" in text if text.isascii() else UNSAFE.search(text)
+    if not (is_long or is_unsafe or ESCAPED_CONTROL.search(text)):
+        return text
+    return msgspec.json.encode(clean_texts(document)).decode()
 
 
 def _lies_still(path: Path) -> bool:
@@ -139,13 +156,33 @@ def translate_errors(url: URL) -> Iterator[None]:
         raise StoreError(f"{display_url(url)}: a document in it is torn ({error}), restore it from a copy") from None
     except OSError as error:  # of a host that has no address, or none that may be reached
         raise StoreUnavailableError(f"{display_url(url)}: {error.strerror or error}") from error
+    except (exc.StatementError, UnicodeError, OverflowError) as error:  # what a row holds cannot be sent
+        raise StoreError(f"{display_url(url)}: {describe_refusal(error)}") from error
     except exc.SQLAlchemyError as error:  # for example a timeout of the pool
         raise StoreUnavailableError(f"{display_url(url)}: {' '.join(str(error).split())}") from error
+
+
+def is_refusal(error: Exception) -> bool:
+    """Whether a statement failed for what its rows hold, and others would be written; a retry would not help."""
+    if not isinstance(error, exc.DBAPIError):
+        return isinstance(error, exc.StatementError | ValueError | TypeError | OverflowError)
+    if error.connection_invalidated:
+        return False
+    if state := getattr(error.orig, "sqlstate", None):
+        return str(state)[:2] in REFUSING_CLASSES
+    return isinstance(error, exc.DataError | exc.IntegrityError | exc.ProgrammingError)
+
+
+def describe_refusal(error: Exception) -> str:
+    """Return in one line why the rows of a statement were refused."""
+    return " ".join(str(getattr(error, "orig", None) or error).split())
 
 
 def _is_transient(error: exc.DBAPIError) -> bool:
     if error.connection_invalidated:
         return True
+    if is_refusal(error):
+        return False
     if isinstance(error.orig, sqlite3.Error):
         return getattr(error.orig, "sqlite_errorcode", 0) & 0xFF in TRANSIENT_ERRORS
     return isinstance(error, exc.OperationalError | exc.InterfaceError | exc.InternalError)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from servoscope.core.messages import message, render
 from servoscope.prognosis.series import NORMAL_95
+
+if TYPE_CHECKING:
+    import sqlalchemy as sa
 
 Row = Mapping[str, Any]  # of any table
 CHECKS = "checks"  # in the audit: what to check on an asset for a fault, in its owner's words
@@ -14,6 +17,7 @@ NOTE = "note"  # in the audit: what somebody noted about an asset
 BASELINE_NOTE = "baseline"  # kind of the note that a baseline was put in force
 CONFIRMATION = "confirmed"  # kind of the note that what has changed after a repair is no fault
 RELEARN = "relearn"  # command: take the baseline that an asset has now
+BEGUN = "begun"  # in a command's document: when a service began to execute it [UTC s]
 TEST = "test"  # command: try a webhook, command, message or mail, whose name is in the place of an alarm's
 SIZE_EVERY_S = 600.0  # between two stored values of a coefficient
 # how the outcome of a refused command begins in rows of version 0.1, which have no fields for it
@@ -44,6 +48,20 @@ class CommandOutcome(NamedTuple):
         if "accepted" in document:
             return cls(document["accepted"], document.get("refusal", ""))
         return cls(not outcome.startswith(REFUSAL_PREFIX), outcome.removeprefix(REFUSAL_PREFIX))
+
+
+class RefusedRow(NamedTuple):
+    """A row that the database has refused for what it holds."""
+
+    table: str
+    asset: str
+    row: dict[str, str]  # its values, in short
+    why: str
+
+    @classmethod
+    def of(cls, table: sa.Table, row: Row, why: str) -> RefusedRow:
+        """Return what names a row of a table."""
+        return cls(str(table.name), str(row.get("asset", "")), {name: ascii(row[name])[:100] for name in row}, why)
 
 
 def fault_rows(t: float, kind: str, faults: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:

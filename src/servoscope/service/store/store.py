@@ -25,7 +25,7 @@ from servoscope.service.store.bundles import (
     read_samples,
     write_bundles,
 )
-from servoscope.service.store.rows import CHECKS, NOTE, CommandOutcome, Row
+from servoscope.service.store.rows import BEGUN, CHECKS, NOTE, CommandOutcome, RefusedRow, Row
 
 Result = TypeVar("Result")
 OPENING_S = 5.0  # how long a writer tries to open a file that another process is preparing
@@ -53,23 +53,52 @@ class Batch:
 
     def write(self, connection: sa.Connection, owner: str, commit: int) -> None:
         """Write it in the connection's transaction, as commit number `commit` of its owner."""
-        _upsert(connection, tables.meta, [{"key": commit_key(owner), "value": commit}])
+        for _, statement, rows in self._changes(connection, owner, commit):
+            connection.execute(statement, rows)
+        write_bundles(connection, owner, self.bundles)
+
+    def write_singly(self, connection: sa.Connection, owner: str, commit: int) -> list[RefusedRow]:
+        """Write it as `write` does, row by row, and set aside what the database refuses for its content: return that.
+
+        The audit names each of them.
+        """
+        refused = list[RefusedRow]()
+        for table, statement, rows in self._changes(connection, owner, commit):
+            for row in rows:
+                try:
+                    with connection.begin_nested():
+                        connection.execute(statement, [row])
+                except Exception as error:
+                    if not engine.is_refusal(error):
+                        raise
+                    refused.append(RefusedRow.of(table, row, engine.describe_refusal(error)))
+        write_bundles(connection, owner, self.bundles)
+        if refused:
+            names = {"at": time.time(), "who": "servoscope", "what": "row set aside"}
+            audit = [{"asset": row.asset or owner, **names, "document": row._asdict()} for row in refused]
+            connection.execute(tables.audit.insert(), audit)
+        return refused
+
+    def _changes(
+        self, connection: sa.Connection, owner: str, commit: int
+    ) -> Iterator[tuple[sa.Table, sa.Executable, list[Row]]]:
+        """Yield statements, with their tables and rows, in the order in which they are executed."""
+        dialect = connection.dialect.name
+        yield tables.meta, _upsert(dialect, tables.meta), [{"key": commit_key(owner), "value": commit}]
         for name, rows in self.rows.items():
-            if name == tables.sizes.name and rows:  # a clock that was set back may come to the same time again
-                _upsert(connection, tables.sizes, rows)
-            elif rows:
-                connection.execute(tables.METADATA.tables[name].insert(), rows)
+            table = tables.METADATA.tables[name]
+            if rows:  # a clock that was set back may come to the same time again
+                yield table, _upsert(dialect, table) if table is tables.sizes else table.insert(), rows
         if self.checkpoints:
-            _upsert(connection, tables.checkpoints, list(self.checkpoints.values()))
+            yield tables.checkpoints, _upsert(dialect, tables.checkpoints), list(self.checkpoints.values())
         if self.first_needed:
             first: list[Row] = [{"asset": asset, "sequence": sequence} for asset, sequence in self.first_needed.items()]
-            _upsert(connection, tables.needed, first)
-            connection.execute(OLD_SAMPLES, [{"of": row["asset"], "below": row["sequence"]} for row in first])
-        write_bundles(connection, owner, self.bundles)
+            yield tables.needed, _upsert(dialect, tables.needed), first
+            yield tables.recent, OLD_SAMPLES, [{"of": row["asset"], "below": row["sequence"]} for row in first]
         for key, changes in ((tables.commands.c.id, self.outcomes), (tables.outbox.c.key, self.deliveries)):
             if changes:
-                rows = [{"of": asset, **row} for asset, row in changes.items()]
-                connection.execute(key.table.update().where(key == sa.bindparam("of")), rows)
+                rows = [{"of": name, **row} for name, row in changes.items()]
+                yield key.table, key.table.update().where(key == sa.bindparam("of")), rows
 
 
 def commit_key(owner: str) -> str:
@@ -77,12 +106,8 @@ def commit_key(owner: str) -> str:
     return f"commit of {owner}"
 
 
-def _upsert(connection: sa.Connection, table: sa.Table, rows: list[Row]) -> None:
-    connection.execute(_upsert_statement(connection.dialect.name, table), rows)
-
-
 @cache  # to make a statement takes as long as to execute it for fifty rows
-def _upsert_statement(dialect_name: str, table: sa.Table) -> sa.Insert:
+def _upsert(dialect_name: str, table: sa.Table) -> sa.Insert:
     insert = postgresql.insert(table) if dialect_name == "postgresql" else sqlite.insert(table)
     keys = [column.name for column in table.primary_key]
     changed = {column.name: insert.excluded[column.name] for column in table.c if column.name not in keys}
@@ -209,16 +234,25 @@ class Store:
         with self._transaction() as connection:
             return int(connection.execute(query).scalar() or 0)
 
-    def write(self, batch: Batch, owner: str, commit: int) -> None:
+    def write(self, batch: Batch, owner: str, commit: int) -> list[RefusedRow]:
         """Write a batch whole, as commit number `commit` of its owner, which is one more than `last_commit`.
 
-        Raises StoreUnavailableError if it is not in the store, or that is unknown (`last_commit` shows it), and a
-        retry may help.
+        Rows that the database refuses for what they hold are left out, named in the audit, and returned. Raises
+        StoreUnavailableError if the batch is not in the store, or that is unknown (`last_commit` shows it), and a retry
+        may help.
         """
         if self._lock is not None:
             self._lock.acquire()
-        with self._transaction() as connection:
-            batch.write(connection, owner, commit)
+        with engine.translate_errors(self._url):
+            try:
+                with self._engine.begin() as connection:
+                    batch.write(connection, owner, commit)
+            except Exception as error:
+                if not engine.is_refusal(error):
+                    raise
+                with self._engine.begin() as connection:
+                    return batch.write_singly(connection, owner, commit)
+        return []
 
     def add_command(
         self, user: str, asset: str, alarm: str, command: str, *, reason: str = "", for_s: float | None = None
@@ -239,6 +273,13 @@ class Store:
         """Return the commands that are not yet executed."""
         table = tables.commands
         return self.fetch(sa.select(table).where(table.c.outcome.is_(None)).order_by(table.c.id))
+
+    def begin_commands(self, rows: Iterable[Row]) -> None:
+        """Note of commands that they are under way: should the process end with one of them, it is not tried again."""
+        begun = [{"of": row["id"], "document": {**row["document"], BEGUN: time.time()}} for row in rows]
+        table = tables.commands
+        with self._transaction() as connection:
+            connection.execute(table.update().where(table.c.id == sa.bindparam("of")), begun)
 
     def checkpoints(self, assets: Sequence[str] | None = None) -> dict[str, Row]:
         """Return the newest checkpoint of these assets, or of all, by name; without those that have none."""

@@ -7,9 +7,31 @@ lost or written twice can be detected.
 
 from __future__ import annotations
 
+from typing import Any
+
 import sqlalchemy as sa
 
+from servoscope.core.texts import MAX_TEXT_CHARS, clean_text
+
 METADATA = sa.MetaData()
+MAX_KEY_CHARS = 200  # of a text in an index: PostgreSQL takes 2704 bytes of an entry
+
+
+class CleanText(sa.TypeDecorator[str]):
+    """A text of up to so many characters, written and looked for as `clean_text` returns it."""
+
+    impl, cache_ok = sa.Text, True
+
+    def __init__(self, longest: int = MAX_TEXT_CHARS) -> None:
+        super().__init__()
+        self.longest = longest
+
+    def process_bind_param(self, value: Any, dialect: sa.Dialect) -> Any:
+        """Return what is sent to the database."""
+        return clean_text(value, self.longest) if isinstance(value, str) else value
+
+
+Text, Key = CleanText(), CleanText(MAX_KEY_CHARS)
 
 Identity = sa.BigInteger().with_variant(sa.Integer(), "sqlite")  # the only kind that SQLite counts up by itself
 
@@ -26,7 +48,7 @@ def _numbered_table(name: str, *columns: sa.Column[object]) -> sa.Table:
     return sa.Table(
         name,
         METADATA,
-        sa.Column("asset", sa.Text, primary_key=True),
+        sa.Column("asset", Key, primary_key=True),
         sa.Column("number", sa.BigInteger, primary_key=True, autoincrement=False),
         sa.Column("t", sa.Double, nullable=False),
         *columns,
@@ -36,12 +58,12 @@ def _numbered_table(name: str, *columns: sa.Column[object]) -> sa.Table:
 
 
 meta = sa.Table(  # schema: version of the tables; commit of NAME: number of that service's last transaction
-    "meta", METADATA, sa.Column("key", sa.Text, primary_key=True), sa.Column("value", sa.BigInteger, nullable=False)
+    "meta", METADATA, sa.Column("key", Key, primary_key=True), sa.Column("value", sa.BigInteger, nullable=False)
 )
 checkpoints = sa.Table(  # the state from which `run` continues each asset, and what `watch` shows
     "checkpoints",
     METADATA,
-    sa.Column("asset", sa.Text, primary_key=True),
+    sa.Column("asset", Key, primary_key=True),
     sa.Column("sequence", sa.BigInteger, nullable=False),
     sa.Column("state", sa.LargeBinary, nullable=False),
     sa.Column("status", sa.JSON, nullable=False),
@@ -52,7 +74,7 @@ bundles = sa.Table(  # the blocks of a commit, those of the assets of a bundle i
     "bundles",
     METADATA,
     sa.Column("bundle", sa.Integer, primary_key=True, autoincrement=False),
-    sa.Column("owner", sa.Text, primary_key=True),  # the service that follows its assets
+    sa.Column("owner", Key, primary_key=True),  # the service that follows its assets
     sa.Column("number", sa.BigInteger, primary_key=True, autoincrement=False),
     sa.Column("contents", sa.Text, nullable=False),  # JSON: whose blocks, which, how long
     sa.Column("samples", sa.LargeBinary, nullable=False),
@@ -60,14 +82,14 @@ bundles = sa.Table(  # the blocks of a commit, those of the assets of a bundle i
 recent = sa.Table(  # blocks with a row of their own: of older versions, and what a bundle's row would be kept for
     "recent",
     METADATA,
-    sa.Column("asset", sa.Text, primary_key=True),
+    sa.Column("asset", Key, primary_key=True),
     sa.Column("sequence", sa.BigInteger, primary_key=True, autoincrement=False),
     sa.Column("samples", sa.LargeBinary, nullable=False),
 )
 needed = sa.Table(  # the first block that an asset's checkpoint needs; earlier ones may still be there
     "needed",
     METADATA,
-    sa.Column("asset", sa.Text, primary_key=True),
+    sa.Column("asset", Key, primary_key=True),
     sa.Column("sequence", sa.BigInteger, nullable=False),
 )
 # All of it is new every few minutes. Noise does not compress; and dead rows are vacuumed by their number: a share of
@@ -89,20 +111,20 @@ residuals = _numbered_table(
 )
 diagnoses = _numbered_table(
     "diagnoses",
-    sa.Column("grounds", sa.Text, nullable=False),  # examination: at once; full: seconds later, with the refit
-    sa.Column("verdict", sa.Text, nullable=False),
-    sa.Column("summary", sa.Text, nullable=False),
+    sa.Column("grounds", Text, nullable=False),  # examination: at once; full: seconds later, with the refit
+    sa.Column("verdict", Text, nullable=False),
+    sa.Column("summary", Text, nullable=False),
     sa.Column("onset", sa.Double),
     sa.Column("document", sa.JSON, nullable=False),
 )
 sizes = sa.Table(  # faults and coefficients over years, thinned (`series.py`)
     "sizes",
     METADATA,
-    sa.Column("asset", sa.Text, primary_key=True),
+    sa.Column("asset", Key, primary_key=True),
     sa.Column("t", sa.Double, primary_key=True),
     # full: a fault by a full diagnosis; live: a fault by an examination; coefficient: by the recursion
-    sa.Column("kind", sa.Text, primary_key=True),
-    sa.Column("name", sa.Text, primary_key=True),
+    sa.Column("kind", Key, primary_key=True),
+    sa.Column("name", Key, primary_key=True),
     sa.Column("value", sa.Double, nullable=False),  # of a fault: a ratio to healthy
     sa.Column("low", sa.Double, nullable=False),  # low, high: 95 % interval
     sa.Column("high", sa.Double, nullable=False),
@@ -111,23 +133,23 @@ sizes = sa.Table(  # faults and coefficients over years, thinned (`series.py`)
 )
 transitions = _numbered_table(
     "transitions",
-    sa.Column("alarm", sa.Text, nullable=False),
-    sa.Column("before", sa.Text, nullable=False),
-    sa.Column("after", sa.Text, nullable=False),
-    sa.Column("cause", sa.Text, nullable=False),
-    sa.Column("who", sa.Text, nullable=False),
+    sa.Column("alarm", Text, nullable=False),
+    sa.Column("before", Text, nullable=False),
+    sa.Column("after", Text, nullable=False),
+    sa.Column("cause", Text, nullable=False),
+    sa.Column("who", Text, nullable=False),
     sa.Column("document", sa.JSON, nullable=False),
 )
 outbox = sa.Table(  # what is still to be delivered to webhooks, commands and brokers, and what was
     "outbox",
     METADATA,
-    sa.Column("key", sa.Text, primary_key=True),
-    sa.Column("sink", sa.Text, nullable=False),
+    sa.Column("key", Key, primary_key=True),
+    sa.Column("sink", Text, nullable=False),
     sa.Column("event", sa.JSON, nullable=False),
     sa.Column("created", sa.Double, nullable=False),
     sa.Column("due", sa.Double),  # of the next attempt; none: there will be no more
     sa.Column("attempts", sa.Integer, nullable=False),
-    sa.Column("outcome", sa.Text, nullable=False),
+    sa.Column("outcome", Text, nullable=False),
     sa.Index("outbox_by_due", "due"),
 )
 audit = sa.Table(
@@ -135,9 +157,9 @@ audit = sa.Table(
     METADATA,
     sa.Column("id", Identity, primary_key=True),
     sa.Column("at", sa.Double, nullable=False),
-    sa.Column("who", sa.Text, nullable=False),
-    sa.Column("asset", sa.Text, nullable=False),  # empty: the service as a whole
-    sa.Column("what", sa.Text, nullable=False),
+    sa.Column("who", Text, nullable=False),
+    sa.Column("asset", Key, nullable=False),  # empty: the service as a whole
+    sa.Column("what", Text, nullable=False),
     sa.Column("document", sa.JSON, nullable=False),
     sa.Index("audit_by_time", "at"),
 )
@@ -146,10 +168,10 @@ commands = sa.Table(  # what operators ask for; the service executes them
     METADATA,
     sa.Column("id", Identity, primary_key=True),
     sa.Column("at", sa.Double, nullable=False),
-    sa.Column("who", sa.Text, nullable=False),
-    sa.Column("asset", sa.Text, nullable=False),
-    sa.Column("alarm", sa.Text, nullable=False),
-    sa.Column("command", sa.Text, nullable=False),
+    sa.Column("who", Text, nullable=False),
+    sa.Column("asset", Key, nullable=False),
+    sa.Column("alarm", Text, nullable=False),
+    sa.Column("command", Text, nullable=False),
     sa.Column("document", sa.JSON, nullable=False),
-    sa.Column("outcome", sa.Text),  # none until it was executed
+    sa.Column("outcome", Text),  # none until it was executed
 )
