@@ -20,7 +20,7 @@ from servoscope.diagnosis.result import Diagnosis, FaultInterval, RefitSummary
 from servoscope.isolation.candidate import Candidate, FaultEstimate
 from servoscope.service.assets.examination import StoredDiagnosis
 from servoscope.service.store import Store
-from servoscope.service.store.store import Batch
+from servoscope.service.store import Batch
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is missing: make install brings it")
 
