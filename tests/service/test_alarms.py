@@ -276,7 +276,7 @@ def test_a_transition_goes_to_json_and_back() -> None:
 def test_alarms_need_no_configuration_and_say_what_to_do() -> None:
     settings = AlarmSettings()
     assert list(settings.asset_alarms) == ["fault", "data_quality", "reception", "limit", "undetermined"]
-    assert list(settings.service_alarms) == ["connection", "buffering"]
+    assert list(settings.service_alarms) == ["connection", "left_out", "backlog", "buffering"]
     for one in settings.definitions.values():
         assert one.consequence and one.operator_action and one.response_time_s
     assert AlarmSettings.model_validate(settings.model_dump()) == settings

@@ -19,8 +19,7 @@ from servoscope.diagnosis.explanation import build_headline
 from servoscope.diagnosis.result import Diagnosis, FaultInterval, RefitSummary
 from servoscope.isolation.candidate import Candidate, FaultEstimate
 from servoscope.service.assets.examination import StoredDiagnosis
-from servoscope.service.store import Store
-from servoscope.service.store import Batch
+from servoscope.service.store import Batch, Store
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is missing: make install brings it")
 

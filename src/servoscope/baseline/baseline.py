@@ -303,8 +303,12 @@ class Baseline(ShortRepr, LearnedEvidence):
 
         Raises OutputError if the file cannot be written.
         """
+        atomic_write(Path(path), self.to_text().encode())
+
+    def to_text(self) -> str:
+        """Return the baseline as JSON, as `save` writes it."""
         content = {"format": FORMAT, "version": VERSION, **self.model_dump(mode="json", by_alias=True)}
-        atomic_write(Path(path), (json.dumps(content, indent=1) + "\n").encode())
+        return json.dumps(content, indent=1) + "\n"
 
     def _shown_facts(self) -> dict[str, object]:
         healthy = ", ".join(f"{name} {value:.4g}" for name, value in zip(self.names, self.theta, strict=True))
@@ -325,13 +329,19 @@ class Baseline(ShortRepr, LearnedEvidence):
 
         Raises BaselineError if the file is missing, is no baseline, or is one of another version.
         """
-        path = Path(path)
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            text = Path(path).read_bytes()
         except FileNotFoundError:
             raise BaselineError(f"{path}: no such file; make a baseline with servoscope learn") from None
         except OSError as error:
             raise BaselineError(f"{path}: cannot be read ({error.strerror or error})") from None
+        return cls.parse(text, path)
+
+    @classmethod
+    def parse(cls, text: str | bytes, path: str | Path) -> Self:
+        """Return the baseline of a text that `to_text` made, or raise BaselineError; `path`: what messages call it."""
+        try:
+            content = json.loads(text if isinstance(text, str) else text.decode())
         except (ValueError, RecursionError):
             raise BaselineError(
                 f"{path}: is not a baseline (no JSON); give the file that servoscope learn wrote"

@@ -38,6 +38,16 @@ def step_back(path: Path, who: str = "", why: str = "") -> Baseline:
 
     Raises BaselineError if there is none.
     """
+    restored = restore_parent(path, who, why)
+    replace_baseline(path, restored)
+    return restored
+
+
+def restore_parent(path: Path, who: str = "", why: str = "") -> Baseline:
+    """Return the baseline that the present one was made from, as the next of the history; it is not put in force.
+
+    Raises BaselineError if there is none.
+    """
     history = read_history(path)
     *_, present = history.values()
     restored = history.get(present.revision.parent)
@@ -53,6 +63,4 @@ def step_back(path: Path, who: str = "", why: str = "") -> Baseline:
         parent=known.parent,
         reference=known.reference,
     )
-    restored = restored.model_copy(update={"revision": revision})
-    replace_baseline(path, restored)
-    return restored
+    return restored.model_copy(update={"revision": revision})

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import bisect
 import shutil
-import time
-from collections import deque
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
-from itertools import chain
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from servoscope.baseline.arm import AnyBaseline, ArmBaseline, load_baseline
@@ -21,18 +17,17 @@ from servoscope.service.actions import CommandSettings, EmailSettings, WebhookSe
 from servoscope.service.actions.settings import SINKS, Sink
 from servoscope.service.assets.arm_asset import ArmAsset
 from servoscope.service.assets.asset import Asset, AssetPolicy
-from servoscope.service.assets.checkpoint import StreamPosition, unpack_state
 from servoscope.service.assets.examination import compile_examination
 from servoscope.service.assets.groups import AssetGroups
 from servoscope.service.assets.outlook import AssetLimits
-from servoscope.service.assets.reception import UNHEARD_RECEPTION
 from servoscope.service.config import ServiceFile
 from servoscope.service.notifications import Notifier
 from servoscope.service.publishers.base import StatusPublisher
-from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.resumption import resume_assets
+from servoscope.service.sources.block import ResumePosition
 from servoscope.service.sources.inbox import Inbox
 from servoscope.service.sources.message import SourceAsset
-from servoscope.service.store import Row, Store
+from servoscope.service.store import Store
 from servoscope.service.store.engine import parse_store_url
 
 
@@ -47,14 +42,15 @@ class ServiceComponents:
     publishers: dict[str, StatusPublisher]
     store: Store
     restarted: tuple[str, ...] = ()  # those that begin with a new state
+    left_out: Mapping[str, str] = field(default_factory=dict)  # assets that cannot be followed, and why
 
 
 def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> ServiceComponents:
     """Open what a service file names.
 
     Assets in `restarted` begin with a new state, behind the samples that were counted; so does the service itself,
-    under its name. Raises ServoscopeError if a baseline, a recording, the store or a saved state cannot be used;
-    nothing is left open.
+    under its name. An asset whose saved state cannot be used is left out. Raises ServoscopeError if a baseline, a
+    recording, the store or the service's own state cannot be used; nothing is left open.
     """
     known = [*config.assets, config.name]
     check_restarted(restarted, known)
@@ -71,9 +67,11 @@ def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> Se
             notifier.begin(rows[config.name]["sequence"])
         elif config.name in rows:
             notifier.resume(rows[config.name]["state"])
-        groups = AssetGroups(assets)
         store.take_over(config.name, assets)
-        resume_assets(groups, assets, store, rows, restarted)
+        assets, groups, anew, left_out = resume_assets(config, assets, store, rows, restarted)
+        if left_out:
+            config = config.without(left_out)
+            sources = _build_sources(config, assets)
         for name, source in sources.items():
             open_source(config, name, source, assets)
         for publisher in publishers.values():
@@ -81,50 +79,15 @@ def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> Se
     except BaseException:
         store.close()
         raise
-    order = tuple(name for name in known if name in restarted)
-    return ServiceComponents(assets, groups, notifier, sources, publishers, store, order)
+    if config.name in restarted:
+        anew = (*anew, config.name)
+    return ServiceComponents(assets, groups, notifier, sources, publishers, store, anew, left_out)
 
 
 def check_restarted(names: Collection[str], known: Collection[str]) -> None:
     """Raise ConfigError unless all that is to begin with a new state is known."""
     if strange := set(names) - set(known):
         raise ConfigError(f"--anew {min(strange)}: no such asset, choose from {', '.join(known)}")
-
-
-def resume_assets(
-    groups: AssetGroups,
-    assets: Mapping[str, Asset],
-    store: Store,
-    rows: Mapping[str, Row],
-    restarted: Collection[str],
-) -> None:
-    """Let assets go on from their rows in the store; those in `restarted` with a new state behind what was counted.
-
-    Raises StateError if a saved state cannot be used.
-    """
-    uncounted, behind = list[Block](), set[str]()  # behind: assets of which the store may know more than their states
-    stored = store.recent_samples_of([name for name in assets if name in rows])
-    for name, samples in chain(stored, ((name, []) for name in assets if name not in rows)):
-        asset, blocks = assets[name], [Block.unpack(name, *sample) for sample in samples]
-        if name in restarted and name in rows:
-            position = StreamPosition(**rows[name]["status"]["counted"])
-            for block in blocks[
-                bisect.bisect_left(blocks, position.blocks, key=lambda candidate: candidate.sequence) :
-            ]:
-                position = position.skip(block.t, block.pack())
-            asset.begin(position)
-            behind.add(name)
-        elif name in rows:
-            left = asset.resume(unpack_state(rows[name]["state"], name), blocks)
-            uncounted += left
-            behind |= {name} if left else set()
-        if not asset.heard:
-            asset.expect(time.time())
-            asset.reception = UNHEARD_RECEPTION
-    # their checkpoints waited; all that they lead to is the state after them
-    deque(groups.process(uncounted), maxlen=0)
-    for name, number in store.last_residuals(behind).items():
-        assets[name].count_rows(number)
 
 
 def build_visit(config: ServiceFile) -> tuple[dict[str, Asset], dict[str, Inbox]]:

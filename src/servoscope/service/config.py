@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -171,6 +171,14 @@ class ServiceFile(FileSettings):
         shard = self.model_copy(update=update)
         shard._shard = number
         return shard
+
+    def without(self, left_out: Collection[str]) -> Self:
+        """Return the service file without some assets, and without the sources of these alone."""
+        assets = {key: asset for key, asset in self.assets.items() if key not in left_out}
+        lost = {self.assets[key].source for key in left_out if key in self.assets}
+        lost -= {asset.source for asset in assets.values()}
+        sources = {key: source for key, source in self.sources.items() if key not in lost}
+        return self.model_copy(update={"assets": assets, "sources": sources})
 
     def load_again(self, path: Path) -> Self:
         """Read the service file once more, and return the same part of it."""

@@ -11,6 +11,7 @@ from servoscope.core.messages import message, render
 from servoscope.service.alarms import LifecycleEvent, OperatorCommand
 from servoscope.service.assets.records import StepResult, audit_row
 from servoscope.service.assets.status import Announcement
+from servoscope.service.baselines import export_baseline, stored_baseline
 from servoscope.service.config import StoreSettings
 from servoscope.service.log import log
 from servoscope.service.metrics import ServiceMetrics
@@ -126,21 +127,25 @@ class Housekeeping:
             self._execute_command(row)
 
     def _execute_command(self, row: Row) -> None:
-        service, name = self._service, row["asset"]
-        if row["command"] == RELEARN:  # the audit has it already
-            service.reload(service.config.file)
-            service.writer.batch.outcomes[row["id"]] = {"outcome": CommandOutcome(accepted=True).text}
-            return
+        service, name, command = self._service, row["asset"], row["document"]
         try:
-            if BEGUN in row["document"]:  # what it led to went with the process, and may have ended it
+            if row["command"] == RELEARN:
+                if "baseline" in command:  # else of an older servoscope, which had only the file
+                    export_baseline(service.config, name, stored_baseline(name, command))
+                    command = {key: value for key, value in command.items() if key != "baseline"}
+                service.reload(service.config.file)
+            elif BEGUN in row["document"]:  # what it led to went with the process, and may have ended it
                 raise AlarmError(render(message("service.command_interrupted")))
-            self._carry_out(row)
+            else:
+                self._carry_out(row)
             outcome = CommandOutcome(accepted=True)
         except Exception as error:  # no command ends the service
             why = str(error) if isinstance(error, ServoscopeError) else f"{type(error).__name__}: {error}"
             outcome = CommandOutcome(accepted=False, refusal=why)
-        document = outcome.extend(row["document"])
+        document = outcome.extend(command)
         service.writer.batch.outcomes[row["id"]] = {"outcome": outcome.text, "document": document}
+        if row["command"] == RELEARN and outcome.accepted:
+            return  # the audit has it already, as a note
         audit = {"alarm": row["alarm"], "asked": row["at"], **document, "outcome": outcome.text}
         service.writer.add(name, [audit_row(row["command"], audit, row["who"])])
 

@@ -94,7 +94,7 @@ class ServiceMetrics:
         for name, source in service.sources.items():
             for (asset_name, signal), interval in source.update_intervals_s.items():
                 intervals.add_metric([name, asset_name, signal], interval)
-        for name, why in service.troubles.items():
+        for name, why in service.troubles["connection"].items():
             trouble.add_metric([name], float(bool(why)))
         layers = CounterMetricFamily("servoscope_processor_seconds", "Processor time by layer", labels=["layer"])
         shares = TotalCounter({**service.layers.seconds, "metrics": self._render_s})

@@ -15,7 +15,9 @@ from servoscope.service.actions import ActionSettings, FaultToleranceState, Outb
 from servoscope.service.actions.outbox import QUIET_STATES
 from servoscope.service.alarms import (
     FAULT_ALARM,
+    TROUBLE_SOURCES,
     AlarmSettings,
+    AlarmSource,
     AlarmState,
     AlarmTransition,
     AssetSnapshot,
@@ -146,23 +148,28 @@ class Notifier:
         sent = actions.diagnosis_entries(self._settings, alarm, priority, t, now, diagnosis.summary, details)
         return [self._outbox_row(outbox_entry) for outbox_entry in sent]
 
-    def check_service(self, fill_ratio: float, troubles: Mapping[str, str], now: float) -> StepResult:
-        """Take how full the buffer is, and what is wrong with each connection; advance the service's own alarms."""
-        own = {
-            key: service_alarm
-            for key, service_alarm in self._service_alarms.items()
-            if key.partition(".")[2] in ("", *troubles)
-        }
-        self._service_alarms, transitions = own, list[AlarmTransition]()
-        for name, definition in self._alarms.service_alarms.items():
-            if definition.source == "connection":
-                snapshots = {f"{name}.{source}": AssetSnapshot(connection=why) for source, why in troubles.items()}
+    def check_service(
+        self, fill_ratio: float, troubles: Mapping[AlarmSource, Mapping[str, str]], now: float
+    ) -> StepResult:
+        """Take how full the buffer is, and what is wrong, by its kind and name; advance the service's own alarms.
+
+        An asset that is not left out any more has no trouble: its alarm clears.
+        """
+        definitions, transitions = self._alarms.service_alarms, list[AlarmTransition]()
+        before, self._service_alarms = self._service_alarms, {}
+        for name, definition in definitions.items():
+            if definition.source in TROUBLE_SOURCES:
+                words = {f"{name}.{whose}": why for whose, why in troubles.get(definition.source, {}).items()}
+                if definition.source == "left_out":
+                    over = [key for key, alarm in before.items() if alarm_kind(key) == name and alarm.state != "normal"]
+                    words = dict.fromkeys(over, "") | words
+                snapshots = {key: AssetSnapshot(trouble=why) for key, why in words.items()}
             else:
                 cause = render(message("alarm.cause_buffer", share=fill_ratio))
                 snapshots = {name: AssetSnapshot(buffered=fill_ratio, cause=cause)}
             for key, snapshot in snapshots.items():
-                before = own.get(key) or initial_alarm_state(self.name, key, now)
-                own[key], further = step_alarm(definition, before, snapshot, now)
+                alarm = before.get(key) or initial_alarm_state(self.name, key, now)
+                self._service_alarms[key], further = step_alarm(definition, alarm, snapshot, now)
                 transitions += further
         return self._step_result(transitions)
 

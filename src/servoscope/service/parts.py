@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from servoscope.service.actions.dispatcher import OutboxDispatcher
+from servoscope.service.alarms import AlarmSource
 from servoscope.service.assets.asset import Asset
 from servoscope.service.assets.reception import ReceptionClock, ReceptionLog
 from servoscope.service.assets.records import StepResult
@@ -33,7 +34,7 @@ class ServiceParts:
         self.layers, self.last_turn = components.groups.layers, monotonic()  # a service that hangs is not alive
 
     def _take_components(self, config: ServiceFile, components: ServiceComponents) -> None:
-        self.config, self._components = config, components
+        self.config, self._components = config.without(components.left_out), components
         self.sources, self.store, self._publishers = components.sources, components.store, components.publishers
         self.assets, self.notifier, self._groups = components.assets, components.notifier, components.groups
         # those of which a full diagnosis may be pending, in order
@@ -63,8 +64,14 @@ class ServiceParts:
         self.writer.add(self.config.name, self.notifier.notify(result.transitions, details, now))
 
     @property
-    def troubles(self) -> dict[str, str]:
-        """What is wrong with the connection of each source and outlet, in words, by its name; empty: nothing."""
+    def troubles(self) -> dict[AlarmSource, Mapping[str, str]]:
+        """What is wrong, in words, by its kind and name; empty: nothing."""
         # a publisher of another package may say nothing
         outlets = {name: str(getattr(publisher, "trouble", "")) for name, publisher in self._publishers.items()}
-        return outlets | {name: outlets.get(name, "") or source.trouble for name, source in self.sources.items()}
+        sources = {name: outlets.get(name, "") or source.trouble for name, source in self.sources.items()}
+        backlogs = {name: source.transport.backlog for name, source in self.sources.items()}
+        return {
+            "connection": outlets | sources,
+            "left_out": self._components.left_out,
+            "backlog": {name: backlog.trouble for name, backlog in backlogs.items() if backlog},
+        }

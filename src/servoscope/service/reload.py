@@ -7,8 +7,6 @@ from typing import Any
 
 from servoscope.core.errors import ServoscopeError
 from servoscope.service.assets.asset import Asset
-from servoscope.service.assets.checkpoint import unpack_state
-from servoscope.service.assets.groups import AssetGroups
 from servoscope.service.build import (
     ServiceComponents,
     build_assets,
@@ -16,12 +14,13 @@ from servoscope.service.build import (
     build_source,
     check_actions,
     open_source,
-    resume_assets,
     source_assets,
 )
 from servoscope.service.config import ServiceFile
 from servoscope.service.log import log
 from servoscope.service.notifications import Notifier
+from servoscope.service.resumption import resume_assets
+from servoscope.service.sources.inbox import Inbox
 
 Changes = dict[str, list[str]]  # names: assets added, removed, changed and begun anew; sources and outlets opened
 
@@ -42,13 +41,7 @@ def reload_components(
     kept = [name for name in assets if name in running.assets]
     same = [name for name in kept if _identity(config, assets, name) == _identity(before, running.assets, name)]
     assets |= {name: running.assets[name] for name in same}  # their states and windows stay where they are
-    sources = {
-        name: running.sources[name]
-        if name in running.sources
-        and _source_identity(config, assets, name) == _source_identity(before, running.assets, name)
-        else build_source(config, assets, name)
-        for name in config.sources
-    }
+    sources = _keep_sources(config, assets, before, running)
     publishers = {
         name: running.publishers[name] if before.outlets.get(name) == outlet else build_publisher(config, name)
         for name, outlet in config.outlets.items()
@@ -58,15 +51,13 @@ def reload_components(
     try:
         store.acquire_lock([config.name, *assets])
         rows = store.checkpoints([config.name, *assets])
-        resumed = {name: rows[name] for name in new if name in rows}
-        anew = tuple(
-            name
-            for name, row in resumed.items()
-            if unpack_state(row["state"], name).baseline != new[name].baseline.hash
-        )
-        groups = AssetGroups(assets, running.groups.layers)
         store.take_over(config.name, new)
-        resume_assets(groups, new, store, resumed, anew)
+        assets, groups, anew, left_out = resume_assets(
+            config, assets, store, rows, (), running.assets, running.groups.layers
+        )
+        if left_out:
+            config, new = config.without(left_out), {name: new[name] for name in new if name in assets}
+            sources = _keep_sources(config, assets, before, running)
         notifier = Notifier(config.name, config.alarms, config.actions)
         notifier.resume(running.notifier.checkpoint()["state"])
     except ServoscopeError:
@@ -97,7 +88,20 @@ def reload_components(
         "anew": list(anew),
         "opened": [*opened, *outlets],
     }
-    return ServiceComponents(assets, groups, notifier, sources, publishers, store, anew), changes
+    return ServiceComponents(assets, groups, notifier, sources, publishers, store, anew, left_out), changes
+
+
+def _keep_sources(
+    config: ServiceFile, assets: Mapping[str, Asset], before: ServiceFile, running: ServiceComponents
+) -> dict[str, Inbox]:
+    """Return the sources of a service file: those that run and are as they were, and new ones, not yet open."""
+    return {
+        name: running.sources[name]
+        if name in running.sources
+        and _source_identity(config, assets, name) == _source_identity(before, running.assets, name)
+        else build_source(config, assets, name)
+        for name in config.sources
+    }
 
 
 def _identity(config: ServiceFile, assets: Mapping[str, Asset], name: str) -> tuple[Any, ...]:

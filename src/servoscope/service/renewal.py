@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import BaseModel
 
 from servoscope.baseline.baseline import Baseline
-from servoscope.baseline.history import history_folder, replace_baseline, step_back
-from servoscope.baseline.records import RENEWALS, Occasion
+from servoscope.baseline.history import history_folder, restore_parent
+from servoscope.baseline.records import Occasion
 from servoscope.core.errors import BaselineError, RecordingError
 from servoscope.core.files import make_folder
 from servoscope.core.messages import Message, message
@@ -19,10 +19,11 @@ from servoscope.learning.detectability import forecast_changes
 from servoscope.prognosis.series import NORMAL_95
 from servoscope.service.assets.examination import blocks_to_recording
 from servoscope.service.assets.status import MIN_LEARN_S, AssetStatus
+from servoscope.service.baselines import announce_baseline
 from servoscope.service.config import ServiceFile
 from servoscope.service.sources.block import Block
 from servoscope.service.store import Store
-from servoscope.service.store.rows import BASELINE_NOTE, CONFIRMATION, NOTE, RELEARN
+from servoscope.service.store.rows import BASELINE_NOTE, CONFIRMATION, NOTE
 from servoscope.service.store.series import read_notes, read_series
 from servoscope.signals import Recording, readers
 from servoscope.signals.writers import plain_columns, write_recording
@@ -156,15 +157,10 @@ def put_in_force(
 
     Raises BaselineError if another one was put in force since its preview, OutputError if a file cannot be written.
     """
-    own, present = config.relearned_file(asset), Baseline.load(config.baseline_file(asset))
-    if present.revision.number != baseline.revision.parent:
-        raise BaselineError(f"{asset}: another baseline was put in force meanwhile, look at a new preview")
+    own = config.relearned_file(asset)
     make_folder(history_folder(own))
     write_stretch(history_folder(own), stretch)
-    if not own.exists():
-        present.save(own)
-    replace_baseline(own, baseline)
-    _announce(store, asset, baseline, t)
+    announce_baseline(config, store, asset, baseline.revision.parent, baseline, t)
     return own
 
 
@@ -173,15 +169,6 @@ def go_back(config: ServiceFile, store: Store, asset: str, who: str, why: str, t
     own = config.relearned_file(asset)
     if not own.exists():
         raise BaselineError(f"{asset}: its baseline was never relearned, there is none to go back to")
-    restored = step_back(own, who, why)
-    _announce(store, asset, restored, t)
+    restored = restore_parent(own, who, why)
+    announce_baseline(config, store, asset, Baseline.load(own).revision.number, restored, t)
     return restored
-
-
-def _announce(store: Store, asset: str, baseline: Baseline, t: float) -> None:
-    """Note what was put in force, for curves and audit, and let the service take it."""
-    revision = baseline.revision
-    text = f"baseline {revision.number} ({revision.kind}){': ' if revision.why else ''}{revision.why}"[:200]
-    document = {"t": t, "text": text, "anew": revision.kind in (*RENEWALS, "back"), "kind": BASELINE_NOTE}
-    store.add_audit(revision.who, asset, NOTE, document)
-    store.add_command(revision.who, asset, "", RELEARN, reason=revision.why)

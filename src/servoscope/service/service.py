@@ -278,11 +278,12 @@ class Service(ServiceParts):
     def degraded_reason(self) -> str:
         """Which assets are not followed although the service itself is ready; empty: none."""
         lacking = {name: asset for name, asset in self.assets.items() if asset.reception.state != "followed"}
-        if not lacking:
+        whys = {**self._components.left_out, **{name: asset.reception.why for name, asset in lacking.items()}}
+        if not whys:
             return ""
-        name, first = next(iter(lacking.items()))
-        counts = {"count": len(lacking), "total": len(self.assets)}
-        return render(message("service.degraded_assets", asset=name, why=first.reception.why, **counts))
+        name, why = next(iter(whys.items()))
+        counts = {"count": len(whys), "total": len(self.assets) + len(self._components.left_out)}
+        return render(message("service.degraded_assets", asset=name, why=why, **counts))
 
     def _commit(self) -> None:
         """Write what was gathered; what cannot be written waits."""

@@ -32,8 +32,10 @@ from servoscope.service.alarms.settings import (
     DEFAULT_ALARMS,
     FAULT_ALARM,
     PRIORITIES,
+    TROUBLE_SOURCES,
     AlarmDefinition,
     AlarmSettings,
+    AlarmSource,
     FloodSettings,
     Ne107,
     Priority,
@@ -41,9 +43,10 @@ from servoscope.service.alarms.settings import (
 )
 
 __all__ = [
-    "COMMANDS", "DEFAULT_ALARMS", "FAULT_ALARM", "PRIORITIES", "TRANSITION_TABLE", "AlarmDefinition", "AlarmSettings",
-    "AlarmStandstill", "AlarmState", "AlarmTransition", "AssetSnapshot", "Condition", "FloodSettings", "FloodState",
-    "HeldAlarm", "LifecycleEvent", "LifecycleState", "Ne107", "Ne107Status", "Notification", "OperatorCommand",
-    "Priority", "advance_alarms", "advance_flood", "alarm_kind", "evaluate_condition", "evaluate_ne107",
-    "initial_alarm_state", "next_event_time", "notify_transition", "step_alarm",
+    "COMMANDS", "DEFAULT_ALARMS", "FAULT_ALARM", "PRIORITIES", "TRANSITION_TABLE", "TROUBLE_SOURCES",
+    "AlarmDefinition", "AlarmSettings", "AlarmSource", "AlarmStandstill", "AlarmState", "AlarmTransition",
+    "AssetSnapshot", "Condition", "FloodSettings", "FloodState", "HeldAlarm", "LifecycleEvent", "LifecycleState",
+    "Ne107", "Ne107Status", "Notification", "OperatorCommand", "Priority", "advance_alarms", "advance_flood",
+    "alarm_kind", "evaluate_condition", "evaluate_ne107", "initial_alarm_state", "next_event_time",
+    "notify_transition", "step_alarm",
 ]  # fmt: skip

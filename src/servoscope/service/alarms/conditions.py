@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from servoscope.core.messages import message, render
-from servoscope.service.alarms.settings import ABNORMAL_WORDS, AlarmDefinition, AlarmSource
+from servoscope.service.alarms.settings import ABNORMAL_WORDS, TROUBLE_SOURCES, AlarmDefinition, AlarmSource
 from servoscope.service.assets.reception import Reception
 from servoscope.signals import quality
 
@@ -28,7 +28,8 @@ class AssetSnapshot:
     level: float | None = None
     reception: Reception | None = None  # how its samples come in; None: the service itself
     buffered: float | None = None  # share of the service's buffer that is filled; None: not the service
-    connection: str | None = None  # what is wrong with a connection of the service; None: not a connection
+    # what is wrong with a connection, with an asset that is left out, or with files that wait; None: none of them
+    trouble: str | None = None
     outlook: str | None = None  # whether the limit of its fault is ``near`` or ``reached``; None: it has none
     control: str | None = None  # what is nearly certainly wrong with the control; "": nothing; None: not assessed
     outlook_cause: str = ""  # the prognosis in a sentence
@@ -56,10 +57,10 @@ def evaluate_condition(definition: AlarmDefinition, abnormal: bool, snapshot: As
 
 def observed_words(source: AlarmSource, snapshot: AssetSnapshot) -> tuple[str, ...] | None:
     """Return the words of a source that hold now; None: not known."""
-    reception, trouble = snapshot.reception, snapshot.connection
+    reception, trouble = snapshot.reception, snapshot.trouble
     if source == "reception":  # a source that is down has an alarm of its own
         return None if reception is None or reception.source_down else (reception.state,)
-    if source == "connection":
+    if source in TROUBLE_SOURCES:
         return None if trouble is None else ("trouble",) * bool(trouble)
     value: tuple[str, ...] | str | None = getattr(snapshot, source)
     return (value,) if isinstance(value, str) else value
@@ -71,8 +72,8 @@ def describe_cause(definition: AlarmDefinition, snapshot: AssetSnapshot) -> str:
         return quality.describe_findings(snapshot.quality)
     if definition.source == "reception" and snapshot.reception is not None:
         return snapshot.reception.why
-    if definition.source == "connection":
-        return snapshot.connection or ""
+    if definition.source in TROUBLE_SOURCES:
+        return snapshot.trouble or ""
     if definition.source == "outlook":
         return snapshot.outlook_cause
     if definition.source == "control":

@@ -18,21 +18,23 @@ from servoscope.signals.quality import KINDS
 StrictText = Annotated[str, Field(strict=True)]
 
 AlarmSource = Literal[
-    "verdict", "quality", "reception", "outlook", "statistic", "level", "control", "buffered", "connection"
-]
+    "verdict", "quality", "reception", "outlook", "statistic", "level", "control",
+    "buffered", "connection", "left_out", "backlog",
+]  # fmt: skip
 Priority = Literal["low", "medium", "high", "critical"]
 Ne107 = Literal["good", "maintenance_required", "out_of_specification", "function_check", "failure"]
 
 PRIORITIES: tuple[Priority, ...] = ("low", "medium", "high", "critical")
 ALARM_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
-SERVICE_SOURCES: tuple[AlarmSource, ...] = ("buffered", "connection")  # sources of the service itself
+TROUBLE_SOURCES: tuple[AlarmSource, ...] = ("connection", "left_out", "backlog")  # in words, for each name of its kind
+SERVICE_SOURCES: tuple[AlarmSource, ...] = ("buffered", *TROUBLE_SOURCES)  # sources of the service itself
 SOURCE_WORDS: dict[str, tuple[str, ...]] = {
-    "verdict": ("fault", "undetermined"), "quality": KINDS, "reception": STATES, "connection": ("trouble",),
-    "outlook": ("near", "reached"), "control": CAUSES,
+    "verdict": ("fault", "undetermined"), "quality": KINDS, "reception": STATES,
+    "outlook": ("near", "reached"), "control": CAUSES, **dict.fromkeys(TROUBLE_SOURCES, ("trouble",)),
 }  # fmt: skip
 ABNORMAL_WORDS: dict[str, tuple[str, ...]] = {  # where `when` says nothing
-    "verdict": ("fault",), "quality": KINDS, "reception": ALARMED_STATES, "connection": ("trouble",),
-    "outlook": ("near", "reached"), "control": POOR_CONTROL,
+    "verdict": ("fault",), "quality": KINDS, "reception": ALARMED_STATES,
+    "outlook": ("near", "reached"), "control": POOR_CONTROL, **dict.fromkeys(TROUBLE_SOURCES, ("trouble",)),
 }  # fmt: skip
 
 
@@ -44,7 +46,8 @@ class AlarmDefinition(Settings):
     # limit (``outlook``, of assets that have a limit), the ``statistic`` T^2 or
     # the sequential test's ``level`` as multiples of their limits, or the cause of poor ``control`` that the last
     # minutes show without a baseline (`servoscope assess`); of the service itself the share of the buffer that
-    # waits to be stored, ``buffered``, and the ``connection`` of each source and outlet
+    # waits to be stored, ``buffered``, the ``connection`` of each source and outlet, each asset that is ``left_out``,
+    # and the ``backlog`` of each source of files
     source: AlarmSource
     # words of the source that are abnormal, where it has words; None: ``fault``, any finding, any trouble
     when: tuple[StrictText, ...] | None = None
@@ -126,6 +129,14 @@ DEFAULT_ALARMS: dict[str, dict[str, Any]] = {  # a table of the same name change
         "source": "connection", "on_delay_s": 10.0, "off_delay_s": 60.0,
         "priority": "high", "response_time_s": 900.0, "ne107": "good",
     },
+    "left_out": {
+        "source": "left_out",
+        "priority": "high", "response_time_s": 900.0, "ne107": "good",
+    },
+    "backlog": {
+        "source": "backlog", "on_delay_s": 10.0, "off_delay_s": 60.0,
+        "priority": "medium", "response_time_s": 3600.0, "ne107": "good",
+    },
     "buffering": {
         "source": "buffered", "limit": 0.5, "hysteresis": 0.4, "on_delay_s": 10.0, "off_delay_s": 60.0,
         "priority": "high", "response_time_s": 900.0, "ne107": "good",
@@ -136,7 +147,7 @@ for _name, _default in DEFAULT_ALARMS.items():
 
 
 def alarm_kind(alarm: str) -> str:
-    """Return under which name an alarm is defined: a connection's is ``NAME.SOURCE``, for each source."""
+    """Return under which name an alarm is defined: those of connections and the like are ``NAME.WHOSE``."""
     return alarm.partition(".")[0]
 
 
@@ -177,7 +188,7 @@ class AlarmSettings(Settings):
 
     @property
     def service_alarms(self) -> dict[str, AlarmDefinition]:
-        """The alarms that the service has of itself, by name; each connection has one."""
+        """The alarms that the service has of itself, by name; each connection has one of its own."""
         return {
             name: definition
             for name, definition in self.definitions.items()

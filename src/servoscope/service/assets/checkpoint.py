@@ -17,6 +17,7 @@ from servoscope.service.alarms import AlarmState
 from servoscope.service.assets.examination_schedule import ExaminationState, PendingDiagnosis
 from servoscope.service.assets.outlook import Outlook
 from servoscope.service.assets.residual_history import EvaluationStatus, HistoryState, LatestEvaluation
+from servoscope.service.store.engine import encode_document
 
 MAGIC = b"servoscope state"
 VERSION = 1  # of this format and of all states in it: raised when one of them changes its meaning
@@ -94,8 +95,6 @@ class AssetState:
 
 def pack_state(state: AssetState) -> bytes:
     """Return a state as bytes, with version and digest."""
-    import msgspec
-
     at = {} if state.alarms_at is None else {"at": state.alarms_at}
     document = {
         "asset": state.asset,
@@ -110,7 +109,7 @@ def pack_state(state: AssetState) -> bytes:
         "shown": state.evaluation.status.to_json(),
         **({} if state.outlook is None else {"outlook": state.outlook.model_dump(mode="json")}),
     }
-    text = msgspec.json.encode(document)
+    text = encode_document(document).encode()
     numbers = state.monitor.astype("<f8").tobytes() + state.quality.astype("<f8").tobytes()
     body = HEADER.pack(MAGIC, VERSION, len(text), state.monitor.size, state.quality.size) + text + numbers
     return body + hashlib.blake2b(body, digest_size=DIGEST_BYTES).digest()

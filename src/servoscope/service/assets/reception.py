@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from servoscope.core.messages import message, render
+from servoscope.core.texts import clean_text
 
 ReceptionState = Literal["followed", "unheard", "silent", "slow", "refused"]
 STATES: tuple[ReceptionState, ...] = get_args(ReceptionState)
@@ -20,6 +21,10 @@ class Reception:
     state: ReceptionState
     why: str = ""  # in words; empty where it is followed
     source_down: bool = False  # whether the trouble is that of the source, which has an alarm of its own
+
+    def __post_init__(self) -> None:
+        """Take words from outside as stores and publishers do."""
+        object.__setattr__(self, "why", clean_text(self.why))
 
     @property
     def sentence(self) -> str:

@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from servoscope.core.errors import MessageError
+from servoscope.core.texts import clean_text
 from servoscope.models.loop import Loop
 from servoscope.service.assets.reception import Reception
 from servoscope.service.sources.block import Block, ResumePosition
@@ -51,7 +52,7 @@ class RejectionCounter:
         """Count one; `asset` must be a known one, or empty."""
         with self._lock:
             self._counts[asset, kind] += count
-            self._reasons[asset, kind] = reason
+            self._reasons[asset, kind] = clean_text(reason)  # it comes from outside, and goes everywhere
 
     def take(self) -> list[Rejection]:
         """Return what was rejected since the last call."""
@@ -138,6 +139,14 @@ class Decoder(ABC):
         return ()
 
 
+class Backlog(NamedTuple):
+    """What waits outside to be read: how many files, for how long the oldest [s]; `trouble`: in words, if too long."""
+
+    files: int = 0
+    oldest_s: float = 0.0
+    trouble: str = ""
+
+
 class Transport(ABC):
     """Receives messages. What its own thread appends to `waiting` is handed over; or it overrides `receive`."""
 
@@ -148,6 +157,7 @@ class Transport(ABC):
     asset_troubles: Mapping[str, Reception] = NOTHING
     update_intervals_s: Mapping[tuple[str, str], float] = NOTHING
     layer_seconds: Mapping[str, float] = NOTHING
+    backlog: Backlog | None = None  # None: nothing can wait where it is seen
     pause_s = 0.0  # how long an asset may pause without being silent [s]
 
     def __init__(self) -> None:

@@ -230,7 +230,7 @@ class WriterLock:
         assert self._connection is not None, "acquire comes first"
         with translate_errors(self._url):
             for i, asset in enumerate(assets):
-                lock = sa.select(sa.func.pg_try_advisory_lock(_advisory_lock_key(asset)))
+                lock = sa.select(sa.func.pg_try_advisory_lock(advisory_lock_key(asset)))
                 if not self._connection.execute(lock).scalar():
                     self._unlock_assets(assets[:i])
                     raise StoreError(f"{display_url(self._url)}: another servoscope run follows {asset}, stop it first")
@@ -239,7 +239,7 @@ class WriterLock:
         assert self._connection is not None, "acquire comes first"
         with translate_errors(self._url):
             for asset in assets:
-                self._connection.execute(sa.select(sa.func.pg_advisory_unlock(_advisory_lock_key(asset))))
+                self._connection.execute(sa.select(sa.func.pg_advisory_unlock(advisory_lock_key(asset))))
 
     def _acquire_file(self) -> None:
         if self.file is not None:
@@ -288,7 +288,7 @@ def _lock_file(file: int) -> None:
             time.sleep(0.02)
 
 
-def _advisory_lock_key(asset: str) -> Any:
-    """Return the number of an asset's advisory lock."""
-    digest = hashlib.blake2b(f"servoscope/{asset}".encode(), digest_size=8).digest()
+def advisory_lock_key(name: str) -> Any:
+    """Return the number of an advisory lock: of an asset, by its name, or of something else."""
+    digest = hashlib.blake2b(f"servoscope/{name}".encode(), digest_size=8).digest()
     return int.from_bytes(digest, "big", signed=True)

@@ -15,7 +15,7 @@ from servoscope.core.errors import EmptyStoreError, StoreError, StoreUnavailable
 from servoscope.service.store import engine, schema, tables
 from servoscope.service.store.batch import Batch, commit_key
 from servoscope.service.store.bundles import BundleIndex, dissolve_rows_of_others, read_index, read_samples
-from servoscope.service.store.rows import BEGUN, CHECKS, NOTE, CommandOutcome, RefusedRow, Row
+from servoscope.service.store.rows import BEGUN, CHECKS, NOTE, RELEARN, CommandOutcome, RefusedRow, Row
 
 Result = TypeVar("Result")
 OPENING_S = 5.0  # how long a writer tries to open a file that another process is preparing
@@ -169,6 +169,26 @@ class Store:
         row = {"at": time.time(), "who": user, "asset": asset, "alarm": alarm, "command": command, "document": document}
         with self._transaction() as connection:
             return int(connection.execute(tables.commands.insert().returning(tables.commands.c.id), row).scalar_one())
+
+    def add_baseline(self, user: str, asset: str, note: Row, command: Row, check: Callable[[Row | None], None]) -> None:
+        """Add the note that a baseline is in force and the command to take it, in one transaction, one at a time.
+
+        `check` is given the document of the last such command that the service has not executed, None without one;
+        where it raises, nothing is added.
+        """
+        shared = {"at": time.time(), "who": user, "asset": asset}
+        table = tables.commands
+        pending = sa.select(table.c.document).where(
+            table.c.asset == asset, table.c.command == RELEARN, table.c.outcome.is_(None)
+        )
+        with self._transaction() as connection:
+            if connection.dialect.name == "postgresql":  # SQLite: the first row locks out other writers
+                lock = engine.advisory_lock_key(f"baseline of {asset}")
+                connection.execute(sa.select(sa.func.pg_advisory_xact_lock(lock)))
+            connection.execute(tables.audit.insert(), {**shared, "what": NOTE, "document": dict(note)})
+            check(connection.execute(pending.order_by(table.c.id.desc()).limit(1)).scalar())
+            asked = {**shared, "alarm": "", "command": RELEARN, "document": dict(command)}
+            connection.execute(table.insert(), asked)
 
     def command_outcome(self, command: int) -> CommandOutcome | None:
         """Return what became of a command; None until the service has executed it."""
