@@ -2,10 +2,12 @@
 """Counts the structure of src/servoscope: sizes, comments, and names that several things have.
 
     python scripts/house.py                                     a table
-    python scripts/house.py --compare scripts/house-0.1.json    beside the figures of an earlier release
+    python scripts/house.py --compare scripts/house-1.0.json    beside the figures of an earlier release
     python scripts/house.py --json                              the figures alone, for a later --compare
+    python scripts/house.py --reach                             in addition, what one log reaches: it runs the package
 
-It needs nothing but Python. What is a rule is in ``tests/project/test_architecture.py`` and ``test_names.py``.
+It needs nothing but Python, but for ``--reach``. What is a rule is in ``tests/project/test_architecture.py`` and
+``test_names.py``.
 """
 
 from __future__ import annotations
@@ -13,13 +15,15 @@ from __future__ import annotations
 import argparse
 import ast
 import io
+import itertools
 import json
 import math
 import re
 import statistics
+import subprocess
 import sys
 import tokenize
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,6 +33,31 @@ PACKAGE = Path("src", "servoscope")
 ENTRY = {"__init__", "__main__"}  # the two modules that belong at the top
 LONG = 300
 FUNCTION = ast.FunctionDef | ast.AsyncFunctionDef
+
+# What names a kind of thing, in code without comments and docstrings.
+KINDS = {
+    "covariates": r"[Cc]ovariate",
+    "operating points": r"operating_?point|OperatingPoint",
+    "features": r"[Ff]eature(Model|Evidence|Monitor|_spans)",
+    "arms": r"Arm[A-Z]|is_arm",
+    "pressures": r"Pressure(Model|Layout)|pressure_(model|evidence)",
+    "sequential test": r"sequential|cusum",
+}
+ARM_QUESTION = r"isinstance\(.*ArmBaseline|AnyBaseline|is_arm"
+METHOD = {
+    "baseline",
+    "detection",
+    "isolation",
+    "evidence",
+    "diagnosis",
+    "estimation",
+    "learning",
+    "fit",
+    "design",
+    "prognosis",
+}
+PRODUCTS = {"service", "web", "fleet", "export", "cli"}
+MIN_FIELDS, MIN_SHARED = 4, 0.6  # of two records that are nearly the same
 
 # What tells a tool something, not a reader.
 DIRECTIVE = re.compile(r"#(?:!|\s*(?:noqa|type:\s*ignore|pragma\b|fmt:|mypy:|ruff:|isort:|-\*-))")
@@ -124,8 +153,68 @@ def comments_of(text: str) -> tuple[int, int]:
     return alone, trailing
 
 
+def code_of(source: Source) -> str:
+    """Return the code, without comments and docstrings."""
+    bare = ast.parse(source.text)
+    for node in ast.walk(bare):
+        if isinstance(node, ast.Module | ast.ClassDef | FUNCTION) and ast.get_docstring(node, clean=False) is not None:
+            node.body = node.body[1:] or [ast.Pass()]
+    return ast.unparse(bare)
+
+
+def files_outside(codes: dict[Path, str], pattern: str) -> int:
+    """Count the files that match, but for those in the folder at the top that has most of them."""
+    homes = Counter(path.parts[0] for path, code in codes.items() if re.search(pattern, code))
+    return sum(homes.values()) - max(homes.values(), default=0)
+
+
+def imported_names(sources: Iterable[Source]) -> set[str]:
+    """Return the names of the method that products import."""
+    names = set()
+    for source in sources:
+        for node in ast.walk(source.tree) if source.path.parts[0] in PRODUCTS else ():
+            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[1:2] and not node.level:
+                names |= {alias.name for alias in node.names if str(node.module).split(".")[1] in METHOD}
+    return names
+
+
+def similar_records(sources: Iterable[Source]) -> list[tuple[str, str]]:
+    """Return the pairs of classes whose fields have mostly the same names."""
+    fields = {}
+    for source in sources:
+        for node in ast.walk(source.tree):
+            if isinstance(node, ast.ClassDef):
+                own = {
+                    part.target.id
+                    for part in node.body
+                    if isinstance(part, ast.AnnAssign) and isinstance(part.target, ast.Name)
+                }
+                if len(own) >= MIN_FIELDS:
+                    fields[f"{source.path}:{node.name}"] = own
+    return [
+        (a, b)
+        for (a, first), (b, second) in itertools.combinations(fields.items(), 2)
+        if len(first & second) >= MIN_SHARED * min(len(first), len(second))
+    ]
+
+
+def measure_reach(sources: list[Source]) -> dict[str, float]:
+    """Return what learning, diagnosing and monitoring one log reach, in a process of its own."""
+    script = Path(__file__).with_name("reach.py")
+    told = json.loads(subprocess.run([sys.executable, script], check=True, capture_output=True, text=True).stdout)
+    modules = set(told["modules"])
+    reached = [source for source in sources if ".".join(source.path.with_suffix("").parts) in modules]
+    return {
+        "reach": sum(statements_of(source.tree) for source in reached),
+        "reach_modules": len(reached),
+        "callers": max(count for package, count in told["callers"].items() if package in METHOD),
+    }
+
+
 def measure(sources: list[Source]) -> dict[str, float]:
     """Return the figures."""
+    codes = {source.path: code_of(source) for source in sources}
+    foreign = [code for path, code in codes.items() if "arm" not in path.parts and "arm" not in path.stem.split("_")]
     lengths = sorted(length for source in sources for length in function_lengths(source.tree)) or [0]
     comments = [comments_of(source.text) for source in sources]
     return {
@@ -145,6 +234,10 @@ def measure(sources: list[Source]) -> dict[str, float]:
         "repeated_classes": len(repeated_classes(sources)),
         "repeated_functions": len(repeated_functions(sources)),
         "repeated_modules": len(repeated_modules(sources)),
+        **{f"outside_{kind}": files_outside(codes, pattern) for kind, pattern in KINDS.items()},
+        "arm_questions": sum(bool(re.search(ARM_QUESTION, line)) for code in foreign for line in code.splitlines()),
+        "method_names": len(imported_names(sources)),
+        "similar_records": len(similar_records(sources)),
     }
 
 
@@ -175,13 +268,26 @@ ROWS: list[tuple[str, Callable[[dict[str, float]], str]]] = [
     ("class names that stand twice or more", _plain("repeated_classes")),
     ("names of top-level functions in two files or more", _plain("repeated_functions")),
     ("file names in two folders or more", _plain("repeated_modules")),
+    *((f"files that name {kind}, outside their main folder", _plain(f"outside_{kind}")) for kind in KINDS),
+    ("lines outside files of arms that ask for one", _plain("arm_questions")),
+    ("names of the method that products import", _plain("method_names")),
+    (
+        f"pairs of records of {MIN_FIELDS} fields that share {100 * MIN_SHARED:.0f} % of their names",
+        _plain("similar_records"),
+    ),
+]
+REACH = [
+    ("statements that learning, diagnosing and monitoring one log import", _plain("reach")),
+    ("modules that they import", _plain("reach_modules")),
+    ("files that call into one package of the method during one diagnosis: most", _plain("callers")),
 ]
 
 
 def table(now: dict[str, float], before: dict[str, float] | None = None) -> str:
     """Return the figures as a table in Markdown."""
     columns = [now] if before is None else [before, now]
-    rows = [[label, *(show(figures) for figures in columns)] for label, show in ROWS]
+    shown = [*ROWS, *(REACH if "reach" in now else ())]
+    rows = [[label, *(show(figures) for figures in columns)] for label, show in shown]
     head = ["`src/servoscope`", "now"] if before is None else ["`src/servoscope`", "before", "now"]
     widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
 
@@ -200,11 +306,12 @@ def main() -> int:
     parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parent.parent, help="the project")
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
     parser.add_argument("--compare", type=Path, metavar="FILE.json", help="figures of an earlier --json")
+    parser.add_argument("--reach", action="store_true", help="run one log, and count what it reaches")
     given = parser.parse_args()
     sources = read(given.root / PACKAGE)
     if not sources:
         parser.error(f"no Python files in {given.root / PACKAGE}")
-    now = measure(sources)
+    now = measure(sources) | (measure_reach(sources) if given.reach else {})
     if given.json:
         print(json.dumps(now, indent=2))
         return 0

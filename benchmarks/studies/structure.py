@@ -1,4 +1,4 @@
-"""The structure of the source in figures, before the packages and now; prints a Markdown table.
+"""The structure of the source in figures, of 1.0.0 and now; prints a Markdown table.
 
 python benchmarks studies/structure [--json]
 """
@@ -25,7 +25,7 @@ def main() -> None:
     house = importlib.util.module_from_spec(spec)
     sys.modules["house"] = house
     spec.loader.exec_module(house)
-    before = json.loads((SCRIPTS / "house-0.1.json").read_text(encoding="utf-8"))
+    before = json.loads((SCRIPTS / "house-1.0.json").read_text(encoding="utf-8"))
     lines = [
         line
         for line in house.table(house.measure(house.read(ROOT / "src" / "servoscope")), before).splitlines()

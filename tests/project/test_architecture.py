@@ -294,6 +294,23 @@ def test_the_structure_is_measured(tmp_path: Path) -> None:
     assert re.search(r"two folders or more +\| +1 \| +1 \|", house.table(figures, figures))
 
 
+def test_the_reach_of_a_kind_of_thing_is_measured(tmp_path: Path) -> None:
+    fields = "a: int\n    b: int\n    c: int\n    d: int\n"
+    files = {
+        "arm/model.py": '"""All of ArmModel."""\nis_arm = 1\n',
+        "arm/day.py": "is_arm = 2\n",
+        "web/asset.py": f"x = isinstance(thing, ArmBaseline)\nclass Asset:\n    {fields}",
+        "web/words.py": '"""Says nothing of ArmBaseline."""  # is_arm\nfrom servoscope.diagnosis.arm import judge\n',
+        "service/row.py": f"from servoscope.core import judge\nclass Row:\n    {fields}    e: int\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    figures = house.measure(house.read(tmp_path))
+    names = "outside_arms", "arm_questions", "method_names", "similar_records"
+    assert [figures[name] for name in names] == [1, 1, 1, 1]
+
+
 def plant_questions(source: Any) -> Iterator[int]:
     """Yield the lines that compare the kind of a plant, or ask it for an attribute by name."""
     for node in ast.walk(source.tree):
