@@ -108,7 +108,7 @@ def repeated(names: Iterable[tuple[str, Path]]) -> dict[str, list[Path]]:
 
 
 def repeated_classes(sources: Iterable[Source]) -> dict[str, list[Path]]:
-    """Return the class names that stand twice or more."""
+    """Return the class names that occur twice or more."""
     return repeated((name, source.path) for source in sources for name in source.classes)
 
 
@@ -265,7 +265,7 @@ ROWS: list[tuple[str, Callable[[dict[str, float]], str]]] = [
     (f"files of more than {LONG} lines", _share("long_files", "files")),
     ("comment lines", _share("comment_lines", "nonblank_lines")),
     ("code lines that end in a comment", _share("trailing_comments", "nonblank_lines")),
-    ("class names that stand twice or more", _plain("repeated_classes")),
+    ("class names that occur twice or more", _plain("repeated_classes")),
     ("names of top-level functions in two files or more", _plain("repeated_functions")),
     ("file names in two folders or more", _plain("repeated_modules")),
     *((f"files that name {kind}, outside their main folder", _plain(f"outside_{kind}")) for kind in KINDS),
