@@ -49,7 +49,7 @@ def init(
     from servoscope.cli.render import results
     from servoscope.learning.proposal import PART_ROWS, propose_columns
     from servoscope.signals import readers
-    from servoscope.signals.readers.axes import find_axes, moving_axes
+    from servoscope.signals.readers.axes import axes_of, moving_axes
     from servoscope.signals.readers.table import read_part
 
     log, asks = logs[0], not yes and sys.stdin.isatty() and sys.stdout.isatty()
@@ -61,7 +61,7 @@ def init(
     if asks and reading.columns is None:
         results.print_channels(out, log, channels, reading.rate)
     axes = [reading.axis] if reading.axis is not None or reading.columns is not None else []
-    several = [] if axes else [*find_axes([channel.name for channel in channels])]
+    several = [] if axes else [*axes_of(channels)]
     moving = [*moving_axes(channels)] if several else []
     axes = axes or list[str | None](moving) or [None]
     targets = [_axis_file(output, axis) if len(axes) > 1 or moving else output for axis in axes]

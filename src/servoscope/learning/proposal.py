@@ -13,7 +13,6 @@ import numpy as np
 from pydantic import ValidationError
 
 from servoscope.core import number_format
-from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import IrregularTimeError, LoopError, NotEnoughError, RecordingError, ServoscopeError
 from servoscope.core.files import atomic_write
 from servoscope.core.messages import Message, message, render
@@ -25,7 +24,7 @@ from servoscope.models.loop import Columns, Loop, MonitorSettings
 from servoscope.models.plants import plant_class
 from servoscope.signals import Recording
 from servoscope.signals.readers import ChannelInfo, list_channels, read
-from servoscope.signals.readers.axes import find_axes, signal_names, signals_of_one_axis
+from servoscope.signals.readers.axes import axes_of, own_clock, signal_names, signals_of_one_axis
 from servoscope.signals.readers.columns import LinearCombination, header_hint, parse_combination, parse_fields
 from servoscope.signals.readers.formats import open_file
 from servoscope.signals.readers.guess_columns import (
@@ -38,8 +37,8 @@ from servoscope.signals.readers.guess_columns import (
     quoted_channel,
     turned_channel,
 )
-from servoscope.signals.readers.select import RowFilter
-from servoscope.signals.readers.table import TableFile, number_column, read_part
+from servoscope.signals.readers.select import chosen_values
+from servoscope.signals.readers.table import read_part
 from servoscope.signals.readers.units import split_unit
 from servoscope.signals.readers.wrap import find_wrap
 
@@ -108,7 +107,7 @@ def propose_columns(
     be read.
     """
     if axis is not None:
-        axes = find_axes([channel.name for channel in channels])
+        axes = axes_of(channels)
         if axis not in axes:
             has = f"it has {', '.join(axes)}" if axes else "its names show one axis; name the columns with --columns"
             raise RecordingError(f"{path}: no axis {axis!r}, {has}")
@@ -119,6 +118,7 @@ def propose_columns(
     used = {*texts, *(word for text in texts for pair in re.findall(r"`([^`]+)`|([\w.]+)", text) for word in pair)}
     names = signal_names(channels) if axis is not None else signals_of_one_axis(channels, used)
     fields = {**guess_mapping([name for name in names if name not in used]), **told}
+    fields |= {} if "time" in told else own_clock(channels, fields["output"])
     missing = [letter for letter in "uy" if fields[FIELDS[letter]] is None]
     if missing:
         shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "") + header_hint(names)
@@ -252,7 +252,8 @@ def _further_columns(
     """
     mapped = " ".join([columns.reference, columns.input, *columns.outputs, columns.time or ""])
     opened = open_file(path, columns.text)
-    moving = [c.name for c in list_channels(path, columns.text) if c.name not in mapped and c.min < c.max]
+    channels = (c for c in list_channels(path, columns.text) if c.name != c.clock)
+    moving = [channel.name for channel in channels if channel.name not in mapped and channel.min < channel.max]
     notes = [message("init.target_torque", name=name) for name in moving if names_target_torque(name)]
     kinds = {
         name: kind
@@ -261,7 +262,7 @@ def _further_columns(
         if any(stem in name.casefold() for stem in stems) and not names_target_torque(name)
     }
     slow = {}
-    for name, values in _column_values(opened, list(kinds), where).items():
+    for name, values in chosen_values(opened, list(kinds), where).items():
         x = values[np.isfinite(values)]
         if not x.size or x.min() == x.max():  # in the chosen rows
             continue
@@ -276,17 +277,6 @@ def _further_columns(
         return [], notes
     value = ", ".join(f"{_quoted(key)} = {_quoted(quoted_channel(name))}" for key, name in slow.items())
     return [ProposalLine("columns", "# covariates", f"{{{value}}}", message("init.covariates"))], notes
-
-
-def _column_values(opened: TableFile, names: Sequence[str], where: Mapping[str, str] | None) -> dict[str, FloatArray]:
-    """Return the chosen rows of some columns of a file."""
-    pieces: dict[str, list[FloatArray]] = {name: [] for name in names}
-    chosen = RowFilter(opened, where or {})
-    for table in opened.iter_chunks({*names, *chosen.columns}) if names else ():
-        rows = chosen.mask(table)
-        for name in names:
-            pieces[name].append(number_column(table, name, "init")[rows])
-    return {name: np.concatenate(values) for name, values in pieces.items()}
 
 
 def init(
@@ -344,7 +334,7 @@ def _unwrapped_columns(
             plain[key] = combination
     if len(columns.outputs) > 1:
         plain.pop("output", None)
-    values = _column_values(opened, [name for combination in plain.values() for name in combination.factors], where)
+    values = chosen_values(opened, [name for combination in plain.values() for name in combination.factors], where)
     changes, wraps = {}, {}
     for key, linear_combination in plain.items():
         ((name, factor),) = linear_combination.factors.items()

@@ -26,6 +26,7 @@ class ResampleTarget(NamedTuple):
     rate: float = 0.0  # 0: as measured
     cutoff: float = 0.0  # 0: a tenth of the rate, as the filters have it
     hold: str = "zoh"
+    before: float = 0.0  # error that an earlier resampling has made, as a share of the amplitude at the cutoff
 
     def at(self, measured: float, t: FloatArray) -> ResampleTarget:
         """Return the target with nothing left open, for rows at a measured rate [Hz] with the stamps t [s], shape (N,).
@@ -66,7 +67,13 @@ class UniformRows(NamedTuple):
 
 
 def resample_rows(
-    t: FloatArray, run: Int32Array, columns: list[npt.NDArray[Any]], inputs: set[int], target: ResampleTarget, name: str
+    t: FloatArray,
+    run: Int32Array,
+    columns: list[npt.NDArray[Any]],
+    inputs: set[int],
+    target: ResampleTarget,
+    name: str,
+    begin: float | None = None,
 ) -> UniformRows:
     """Put rows on the grid of the target's rate, run by run, by cubic splines through them.
 
@@ -74,8 +81,8 @@ def resample_rows(
     on the plant is the same; where the log is much faster, a zero-phase filter goes before.
 
     `t`: rising time stamps [s], shape (N,); `run`: shape (N,); `columns`: signals, shape (N,) each; `inputs`: which of
-    them are held as u is; `name`: what errors call the recording. Raises RecordingError if the steps are too long for
-    the cutoff in more than a fifth of the time.
+    them are held as u is; `name`: what errors call the recording; `begin`: a point of the grid [s]; None: the first row
+    of each run is one. Raises RecordingError if the steps are too long for the cutoff in more than a fifth of the time.
     """
     steps = np.diff(t)
     within = run[1:] == run[:-1]
@@ -97,18 +104,18 @@ def resample_rows(
     for first, end in zip(begins.tolist(), ends.tolist(), strict=True):
         if end - first < 4:  # a cubic needs four points
             continue
-        start = origin[int(run[first])]
+        start = origin[int(run[first])] if begin is None else begin
         low = math.ceil((t[first] - start) * target.rate - 1e-6)
         high = math.floor((t[end - 1] - start) * target.rate + 1e-6)
-        for begin in range(low, high + 1, PIECE_ROWS):
-            grid = start + np.arange(begin, min(begin + PIECE_ROWS, high + 1)) / target.rate
+        for lowest in range(low, high + 1, PIECE_ROWS):
+            grid = start + np.arange(lowest, min(lowest + PIECE_ROWS, high + 1)) / target.rate
             a, b = np.searchsorted(t[first:end], grid[[0, -1]])
             rows = slice(max(first, first + int(a) - OVERLAP), min(end, first + int(b) + OVERLAP))
             new = [
                 _resample_stretch(t[rows], x[rows], grid, target, usual, index in inputs)
                 for index, x in enumerate(columns)
             ]
-            stretches.append((grid, int(run[first]) if begin == low else -1 - int(run[first]), new))
+            stretches.append((grid, int(run[first]) if lowest == low else -1 - int(run[first]), new))
     if not stretches:
         raise RecordingError(f"{name}: falls into stretches of under four rows, too short to resample")
     grid = np.concatenate([times for times, *_ in stretches])
@@ -117,7 +124,7 @@ def resample_rows(
     restart[np.cumsum([0, *(times.size for times, *_ in stretches)])[:-1]] = [k >= 0 for _, k, _ in stretches]
     merged = [np.concatenate([new[index] for *_, new in stretches]) for index in range(len(columns))]
     bridged = float(steps[within & ~apart].max())
-    return UniformRows(grid, runs, restart, merged, target.error(bridged), np.flatnonzero(apart))
+    return UniformRows(grid, runs, restart, merged, max(target.error(bridged), target.before), np.flatnonzero(apart))
 
 
 def _resample_stretch(

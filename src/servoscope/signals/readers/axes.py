@@ -6,12 +6,18 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
-from servoscope.signals.readers.guess_columns import guess_columns
+from servoscope.signals.readers.guess_columns import TIME_UNITS, guess_columns
 from servoscope.signals.readers.recording_file import ChannelInfo
+from servoscope.signals.readers.units import split_unit
 
 # what tells axes apart in names: a number, or a letter that stands alone or ends a word as in AxisX
-MARK = re.compile(r"\d+|(?<![A-Za-z0-9])[XYZABCxyzabc](?![A-Za-z0-9])|(?<=[a-z])[XYZABC](?![A-Za-z])")
+MARK = re.compile(
+    r"\d+|(?<![A-Za-z0-9])[XYZABCxyzabc](?![A-Za-z0-9])|(?<=[a-z])[XYZABC](?![A-Za-z])"
+    r"|(?<![A-Za-z])(?:roll|pitch|yaw)(?![A-Za-z])"
+)
+ROTATIONS = {"roll": "x", "pitch": "y", "yaw": "z"}  # which axis each turns about
 
 MAX_AXES = 32  # numbers in more names than that count something else, samples for example
 # the largest over the smallest value, below which a positive column is a supply rather than a signal
@@ -23,6 +29,12 @@ def signal_names(channels: Sequence[ChannelInfo]) -> list[str]:
 
     Those are among them where none of the others may be u or y. Text is time only, and a constant is r only.
     """
+    stamps = {channel.clock for channel in channels if channel.clock}
+    if stamps:  # of several rasters, the time is that of the one that y is of
+        names = signal_names([replace(channel, clock="") for channel in channels if channel.name not in stamps])
+        measured = guess_columns(names).get("y")
+        own = next((channel.clock for channel in channels if channel.name == measured), min(stamps))
+        return [own, *names]
     likely = guess_columns([channel.name for channel in channels])
     clocks = {channel.name for channel in channels if guess_columns([channel.name]).keys() == {"t"}}
     named = [
@@ -41,6 +53,13 @@ def signal_names(channels: Sequence[ChannelInfo]) -> list[str]:
     return names if lost else moving
 
 
+def own_clock(channels: Sequence[ChannelInfo], output: object) -> dict[str, str]:
+    """Return time and unit of the raster that a channel of the output is of, where a file has several."""
+    told = str(output or "")
+    clock = next((channel.clock for channel in channels if channel.clock and channel.name in told), "")
+    return {"time": clock, "time_unit": TIME_UNITS.get(split_unit(clock)[1], "s")} if clock else {}
+
+
 def find_axes(names: Sequence[str]) -> dict[str, list[str]]:
     """Return the columns that each axis can take, by the axis's mark; none where a file has one axis.
 
@@ -52,7 +71,7 @@ def find_axes(names: Sequence[str]) -> dict[str, list[str]]:
         for match in MARK.finditer(name):
             blank = f"{name[: match.start()]}\0{name[match.end() :]}"
             if blank.strip("\0 _[]()"):  # a name that is nothing but its mark tells nothing: x, y
-                groups[match[0]][blank] = name
+                groups[ROTATIONS.get(match[0], match[0])][blank] = name
     shared = {blank for group in groups.values() for blank in group}
     shared = {blank for blank in shared if sum(blank in group for group in groups.values()) > 1}
     own = {mark: [group[blank] for blank in group if blank in shared] for mark, group in groups.items()}
@@ -66,11 +85,17 @@ def find_axes(names: Sequence[str]) -> dict[str, list[str]]:
     return axes if 1 < len(axes) <= MAX_AXES else {}
 
 
+def axes_of(channels: Sequence[ChannelInfo]) -> dict[str, list[str]]:
+    """Return the columns that each axis can take, by the axis's mark, those at rest among them, but no time stamps."""
+    stamps = {channel.clock for channel in channels}
+    return find_axes([channel.name for channel in channels if channel.name not in stamps])
+
+
 def moving_axes(channels: Sequence[ChannelInfo]) -> dict[str, list[str]]:
     """Return the signals of each axis that moves; of one at rest the input, the output or the reference is constant."""
     by_name = {channel.name: channel for channel in channels}
     moving = {}
-    for axis, names in find_axes(list(by_name)).items():
+    for axis, names in axes_of(channels).items():
         guessed = guess_columns(names)
         if all(by_name[guessed[letter]].min < by_name[guessed[letter]].max for letter in "ruy" if letter in guessed):
             moving[axis] = signal_names([by_name[name] for name in names])
@@ -82,7 +107,7 @@ def signals_of_one_axis(channels: Sequence[ChannelInfo], used: Collection[str] =
 
     That is the axis of the columns that are `used`, else the first that moves.
     """
-    axes = find_axes([channel.name for channel in channels])
+    axes = axes_of(channels)
     common = set.intersection(*map(set, axes.values())) if axes else set()
     for names in axes.values():
         if ({*names} - common) & {*used}:

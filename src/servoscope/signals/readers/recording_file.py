@@ -21,6 +21,7 @@ from servoscope.signals import Defect, Recording, clean, with_defects
 from servoscope.signals.readers.columns import LinearCombination, find_channel, parse_combination
 from servoscope.signals.readers.formats import open_file
 from servoscope.signals.readers.frames import Source, open_source
+from servoscope.signals.readers.rasters import join_rasters, raster_clocks
 from servoscope.signals.readers.select import CellReader, ColumnTypeChanged, RowFilter, format_cell
 from servoscope.signals.readers.table import Table, TableFile, TimeColumn, number_column
 from servoscope.signals.readers.wrap import Unwrapper
@@ -35,12 +36,16 @@ TIME_NAMES = ("t", "time", "zeit", "timestamp", "time_s", "seconds", "datetime",
 
 @dataclass(frozen=True)
 class ChannelInfo:
-    """A column of a file: its name, Arrow type, and smallest and largest number (NaN if it holds none)."""
+    """A column of a file: its name, Arrow type, and smallest and largest number (NaN if it holds none).
+
+    `clock`: where a file has several rasters, the column with the time stamps of this one, which may be itself.
+    """
 
     name: str
     dtype: str
     min: float
     max: float
+    clock: str = ""
 
 
 def list_channels(path: str | Path, text: TextLayout | None = None) -> list[ChannelInfo]:
@@ -61,7 +66,9 @@ def list_channels(path: str | Path, text: TextLayout | None = None) -> list[Chan
             numbers = numbers[np.isfinite(numbers)]
             if numbers.size:
                 ranges[name].append((float(numbers.min()), float(numbers.max())))
-    return [_channel_info(name, types[name], ranges[name]) for name in opened.columns]
+    clocks = raster_clocks(opened)
+    listed = (_channel_info(name, types[name], ranges[name]) for name in opened.columns)
+    return [replace(channel, clock=clocks.get(channel.name, "")) for channel in listed]
 
 
 def _channel_info(name: str, types: list[str], ranges: list[tuple[float, float]]) -> ChannelInfo:
@@ -216,7 +223,12 @@ def _read_rows(
     shown = {"r": columns.reference, "u": columns.input, "y": " and ".join(columns.outputs)}
     r, u, y = (letter if letter == text else f"{letter} ({text!r})" for letter, text in shown.items())
     carried = (*sensors, *columns.covariates, *of_plant)
-    options = clock is not None, columns.row_rate, carried, loop, (r, u, y), _resample_target(columns, loop)
+    target = _resample_target(columns, loop)
+    parts_of = {key.split()[-1]: {x for signal in several for x in signal.factors} for key, several in signals.items()}
+    joined = target and join_rasters(opened, wanted, columns, parts_of["input"], parts_of["output"], target)
+    if joined:
+        opened, clock, target = joined
+    options = clock is not None, columns.row_rate, carried, loop, (r, u, y), target
     parts: dict[str, LoggedRows] = {}
     run = 0
     for table in opened.iter_chunks(wanted, texts):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from servoscope.core.arrays import BoolArray
+from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import RecordingError
 from servoscope.signals.readers.columns import find_channel
 from servoscope.signals.readers.table import Table, TableFile, number_column
@@ -139,3 +139,17 @@ def _match_cells(cells: npt.NDArray[np.generic], item: str, context: str) -> Boo
         raise RecordingError(f"{context}: {item!r} is neither a number nor a range such as 1-5")
     numbers = np.asarray(cells, dtype=np.float64)
     return (numbers >= float(between[1])) & (numbers <= float(between[2]))
+
+
+def chosen_values(
+    opened: TableFile, names: Sequence[str], where: Mapping[str, str] | None = None
+) -> dict[str, FloatArray]:
+    """Return some columns of a file, in the rows that meet conditions; columns of several rasters differ in length."""
+    pieces: dict[str, list[FloatArray]] = {name: [] for name in names}
+    chosen = RowFilter(opened, where or {})
+    for together in [[name] for name in names] if opened.channel_groups else [names] if names else []:
+        for table in opened.iter_chunks({*together, *chosen.columns}):
+            rows = chosen.mask(table)
+            for name in together:
+                pieces[name].append(number_column(table, name, "channel")[rows])
+    return {name: np.concatenate(values) for name, values in pieces.items()}

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
-from servoscope.core.errors import EmptyRecordingError, RecordingError
+from servoscope.core.errors import EmptyRecordingError, IrregularTimeError, RecordingError
 from servoscope.signals.readers.clock import ZONED, ClockParser, ZoneOffset, is_clock
 from servoscope.signals.readers.units import parse_quantity
 
@@ -21,7 +21,7 @@ NULL_TEXTS = (
     *("", "NaN", "nan", "NAN", "-nan", "-NaN", "NA", "N/A", "#N/A", "#NA", "null", "NULL", "None", "-", "?"),
     "1.#QNAN",
 )
-SAMPLE_TOGETHER = "take columns of one table, topic or raster, or put them into one"
+SAMPLE_TOGETHER = "--resample (resample = true in [columns]) puts them on one clock"
 CHUNK_ROWS = 1 << 16  # that are read at a time
 MAX_COLUMNS = 20_000  # of a file: beyond that the description of the columns is what fills the memory
 TIME_UNITS_BY_NAME = {"millitm": "ms", "msec": "ms", "ms": "ms", "milliseconds": "ms"}  # beside a time of day
@@ -270,7 +270,9 @@ class TableFile:
         together = max(map(set, self.channel_groups), key=lambda group: len(places & group), default=places)
         if apart := sorted(places - together):
             others = ", ".join(sorted(places & together))
-            raise RecordingError(f"{self.path}: {apart[0]!r} was not sampled together with {others}: {SAMPLE_TOGETHER}")
+            raise IrregularTimeError(
+                f"{self.path}: {apart[0]!r} was not sampled together with {others}: {SAMPLE_TOGETHER}"
+            )
         for table in self.tables([name for name in self.columns if name in places], texts):
             if part is not None and rows >= part.rows:
                 part.cut[self.name] = rows
