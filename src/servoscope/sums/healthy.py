@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
+from servoscope.core.verdict import evidence_limit
 from servoscope.sums.evidence import ChangePrior, posterior
 from servoscope.sums.records import Equations, Sums
 
@@ -60,6 +61,11 @@ class Healthy:
     def wide(self) -> FloatArray:
         """The covariance (p, p) of a change of all coefficients."""
         return np.diag((CHANGE_STD * self.unit) ** 2)
+
+    @property
+    def excess(self) -> float:
+        """What a change within a healthy recording that was left out gained beyond the smallest limit [nats]."""
+        return max(self.limit - evidence_limit(()), 0.0) if self.left_out else 0.0
 
     def effect(self, M: FloatArray, w: FloatArray, scatter: FloatArray) -> FloatArray:
         """Return the likeliest effect (p,) of a recording: multivariate t, for few recordings show the scatter."""

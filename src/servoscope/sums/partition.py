@@ -12,6 +12,7 @@ from servoscope.sums.evidence import ChangePrior
 GRID = 100  # stretches between the times that are tried first; around the changes found, finer ones are
 CONSPICUOUS = 30  # short windows, at most, whose ends are tried as well
 FINER = 4  # times
+CHANGE_BLOCKS = 2  # within which a change comes, and passes the filters: each may have coefficients of its own
 
 
 class Stretch(NamedTuple):
@@ -23,8 +24,8 @@ class Stretch(NamedTuple):
 
     @property
     def inside(self) -> int:
-        """The first block that is not the one within which the change before came."""
-        return self.begin + (0 < self.begin < self.end - 1)
+        """The first block after those within which the change before came."""
+        return self.begin + (min(CHANGE_BLOCKS, self.end - self.begin - 1) if self.begin else 0)
 
 
 class Partition(NamedTuple):
@@ -79,13 +80,16 @@ def _best_on_grid(
     shortest = min(shortest, int(grid[-1]))
     first, last = np.nonzero(grid[None, :] - grid[:, None] >= shortest)
     begin, end = grid[first], grid[last]
-    whole = prior.evidence(M[end] - M[begin], w[end] - w[begin])
-    # a block within which coefficients change has some of its own
-    own = prior.evidence(M[grid[:-1] + 1] - M[grid[:-1]], w[grid[:-1] + 1] - w[grid[:-1]])[1][first]
-    without = prior.evidence(M[end] - M[begin + 1], w[end] - w[begin + 1])
-    own[(begin == 0) | (end - begin == 1)] = -np.inf
     healthy, changed = np.full((2, len(grid), len(grid)), -np.inf)
-    healthy[first, last], changed[first, last] = (np.maximum(a, b + own) for a, b in zip(whole, without, strict=True))
+    healthy[first, last], changed[first, last] = prior.evidence(M[end] - M[begin], w[end] - w[begin])
+    own = np.concatenate([prior.evidence(M[1:] - M[:-1], w[1:] - w[:-1])[1], np.zeros(1)])
+    for blocks in range(1, CHANGE_BLOCKS + 1):
+        inner = (begin > 0) & (end - begin > blocks)
+        rows, columns, at = first[inner], last[inner], begin[inner] + blocks
+        passed = np.sum([own[at - blocks + k] for k in range(blocks)], axis=0)
+        parts = prior.evidence(M[end[inner]] - M[at], w[end[inner]] - w[at])
+        for table, part in zip((healthy, changed), parts, strict=True):
+            table[rows, columns] = np.maximum(table[rows, columns], part + passed)
     single = np.maximum(healthy, changed) - cut
     best, previous = np.full(len(grid), -np.inf), np.zeros(len(grid), dtype=np.int64)
     best[0] = cut  # the first stretch needs no cut

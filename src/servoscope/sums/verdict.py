@@ -42,6 +42,7 @@ class _Judgement:
         self.scatter = healthy.scatter(sums.x)
         self.prior: ChangePrior = healthy.change_prior(sums.x)
         self.shortest = max(round(MIN_S / sums.block_s), 2)
+        self.cut_cost = CUT_COST + healthy.excess
 
     def of(self, begin: int, end: int) -> tuple[FloatArray, FloatArray]:
         """Return information and score of some blocks."""
@@ -80,7 +81,7 @@ class _Judgement:
         best = _Account(float(prior.evidence(*whole)[1]), (Stretch(0, self.blocks, True),))
         for B in (np.zeros(len(whole[1])), self.effect(*whole), self.effect(*begin)):
             for _ in range(ROUNDS):
-                cut = partition(self.M, self.w - self.M @ B, self.prior, CUT_COST, self.shortest)
+                cut = partition(self.M, self.w - self.M @ B, self.prior, self.cut_cost, self.shortest)
                 total = self.gain(B) + cut.evidence
                 if total > best.evidence and any(part.changed for part in cut.stretches):
                     best = _Account(total, cut.stretches)
@@ -88,6 +89,34 @@ class _Judgement:
                     break
                 B = self.effect(*self.of_healthy(cut.stretches))
         return best
+
+    def states(self, stretches: tuple[Stretch, ...]) -> tuple[Stretch, ...]:
+        """Return stretches with those joined that differ by no more than healthy ones of one recording do."""
+        B = self.effect(*self.of_healthy(stretches))
+        states = list(stretches)
+        k = 0
+        while k + 1 < len(states):
+            before, after = states[k], states[k + 1]
+            if before.changed == after.changed and (not after.changed or self._is_one_change(before, after, B)):
+                states[k : k + 2] = [Stretch(before.begin, after.end, after.changed)]
+                k = max(k - 1, 0)
+            else:
+                k += 1
+        return tuple(states)
+
+    def _is_one_change(self, before: Stretch, after: Stretch, B: FloatArray) -> bool:
+        """Return whether two changed stretches are rather one, with the scatter of healthy stretches between them."""
+        S, prior, p = self.healthy.within, self.prior, len(B)
+        M_all, w_all, joint, apart = np.zeros((p, p)), np.zeros(p), 0.0, -self.cut_cost
+        for part in (before, after):
+            M, w = self.of(part.inside, part.end)
+            w = w - M @ B
+            healthy, changed = prior.evidence(M, w)
+            joint, apart = joint + float(healthy), apart + float(changed)
+            softer = np.linalg.solve(np.eye(p) + M @ S, np.column_stack([M, w]))
+            M_all, w_all = M_all + softer[:, :-1], w_all + softer[:, -1]
+        none = prior._replace(inside=np.zeros((p, p)))
+        return joint + float(none.evidence(M_all, w_all)[1]) >= apart
 
     def segments(self, stretches: tuple[Stretch, ...]) -> tuple[Segment, ...]:
         """Return what each stretch shows."""
@@ -140,7 +169,7 @@ def sums_evidence(healthy: Healthy, sums: Sums) -> JudgeEvidence:
     judgement = _Judgement(healthy, sums)
     account = judgement.with_changes()
     # the limit stands for the odds of a change; of those of its time, only the choice among blocks is paid for
-    odds = CHANGE_COST + (CUT_COST - float(np.log(judgement.blocks)) if len(account.stretches) > 1 else 0.0)
+    odds = CHANGE_COST + (judgement.cut_cost - float(np.log(judgement.blocks)) if len(account.stretches) > 1 else 0.0)
     nats = account.evidence - judgement.without_change() + odds
-    stretches = account.stretches if nats > healthy.limit else (Stretch(0, judgement.blocks, False),)
+    stretches = judgement.states(account.stretches) if nats > healthy.limit else (Stretch(0, judgement.blocks, False),)
     return JudgeEvidence("sums", nats, judgement.segments(stretches), len(stretches) > 1)
