@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import hypothesis
 import pytest
 import sqlalchemy as sa
 from reliability.servers import Postgres, programs
+from shares import Share
 
 from servoscope.cli import progress
 from servoscope.service.store import Store, tables
@@ -142,6 +143,21 @@ def store(url: str) -> Iterator[Store]:
     opened = Store.open(url, write=True)
     yield opened
     opened.close()
+
+
+@pytest.fixture
+def share(tmp_path: Path) -> Iterator[Callable[..., Share]]:
+    """Makes folders of logs with a source each, which is closed at the end."""
+    made: list[Share] = []
+
+    def make(*assets: str, **settings: Any) -> Share:
+        made.append(Share(tmp_path / str(len(made)), *assets, **settings))
+        return made[-1]
+
+    yield make
+    for one in made:
+        if one.source is not None:
+            one.source.close()
 
 
 @pytest.fixture

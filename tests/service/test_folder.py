@@ -7,7 +7,7 @@ import gzip
 import os
 import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -24,20 +24,7 @@ from shares import BEGAN, LOOP, Share, csv, rows
 from servoscope.core.errors import ConfigError
 from servoscope.models.loop import Columns
 from servoscope.service.sources import folder as folder_module
-
-
-@pytest.fixture
-def share(tmp_path: Path) -> Iterator[Callable[..., Share]]:
-    made: list[Share] = []
-
-    def make(*assets: str, **settings: Any) -> Share:
-        made.append(Share(tmp_path / str(len(made)), *assets, **settings))
-        return made[-1]
-
-    yield make
-    for one in made:
-        if one.source is not None:
-            one.source.close()
+from servoscope.service.sources import share as share_module
 
 
 def test_files_are_read_in_the_order_of_their_first_time_stamps_and_each_row_counts_once(
@@ -291,15 +278,15 @@ def test_a_file_that_may_not_be_opened_is_tried_again(
     share: Callable[..., Share], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     press = share()
-    opened, locked = Path.open, [True]
+    opened, locked = share_module.Share.file, [True]
 
-    def refuse(path: Path, *args: Any, **more: Any) -> Any:
-        if path.name == "locked.csv" and locked[0]:
+    def refuse(kept: share_module.Share, name: str) -> Any:
+        if name == "locked.csv" and locked[0]:
             raise PermissionError(errno.EACCES, "Permission denied")
-        return opened(path, *args, **more)
+        return opened(kept, name)
 
     press.put("locked.csv", csv(*rows(0, 50)))
-    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr(share_module.Share, "file", refuse)
     source = press.open()
     press.until(lambda: press.rejections["unreadable"])
     assert "Permission denied" in source.asset_troubles["press"].why

@@ -285,3 +285,13 @@ class _Repeated:
 
     def stop(self) -> None:
         self._stopping = True
+
+
+def test_no_data_names_what_was_refused_since() -> None:
+    reception = ReceptionLog(heard_before=False)
+    reception.refuse(0.5, "an old reason")
+    reception.hear(1.0)
+    assert "old" not in reception.evaluate(1000.0, 10.0, "", None).why
+    reception.refuse(2.0, "a.csv: is 120 s ahead")
+    found = reception.evaluate(1000.0, 10.0, "", None)
+    assert found.state == "silent" and found.why == "no data come; what came instead: a.csv: is 120 s ahead"

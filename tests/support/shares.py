@@ -44,6 +44,7 @@ class Share:
         self.rejections = Counter[str]()
         self.reasons: list[Rejection] = []
         self.source: Inbox | None = None
+        self.ahead_s = np.inf
 
     def put(self, name: str, content: str | bytes, *, modified: float | None = None) -> Path:
         path = self.folder / name
@@ -54,7 +55,7 @@ class Share:
         return path
 
     def open(self) -> Inbox:
-        assets = {name: SourceAsset(self.loop, None) for name in self.assets}
+        assets = {name: SourceAsset(self.loop, None, self.ahead_s) for name in self.assets}
         self.source = self.settings.create("hall.share", assets, self.folder.parent)
         self.source.open(self.kept)
         return self.source

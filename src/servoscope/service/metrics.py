@@ -103,8 +103,13 @@ class ServiceMetrics:
         for layer, seconds in shares.items():
             layers.add_metric([layer], seconds)
         up = GaugeMetricFamily("servoscope_source_up", "Whether a source is connected", labels=["source"])
+        files = GaugeMetricFamily("servoscope_files_waiting", "Files that wait to be read", labels=["source"])
+        oldest = GaugeMetricFamily("servoscope_oldest_file_wait_seconds", "Since it was complete", labels=["source"])
         for name, source in service.sources.items():
             up.add_metric([name], float(source.connected))
+            if (backlog := source.transport.backlog) is not None:
+                files.add_metric([name], float(backlog.files))
+                oldest.add_metric([name], backlog.oldest_s)
         places, total = self._latencies
         edges = [*map(floatToGoString, BUCKETS_S), "+Inf"]
         latency = HistogramMetricFamily("servoscope_latency_seconds", "Last sample of a block to its results stored")
@@ -116,6 +121,8 @@ class ServiceMetrics:
             intervals,
             alarm_gauge(self._alarms),
             up,
+            files,
+            oldest,
         )
         for name, words, value in (
             ("store_up", "Whether the last attempt to store succeeded", service.writer.unavailable_since is None),

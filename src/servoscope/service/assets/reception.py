@@ -92,4 +92,7 @@ class ReceptionLog:
         if now - refused_at <= patience_s:
             return Reception("refused", refusal)
         state: ReceptionState = "silent" if self._heard else "unheard"
-        return Reception(state, render(message(f"service.reception.{state}")))
+        why = message(f"service.reception.{state}")
+        if refused_at > (self._heard_at if self._heard else -float("inf")):  # that is why
+            why = message("service.reception.strange", why=render(why), reason=refusal)
+        return Reception(state, render(why))

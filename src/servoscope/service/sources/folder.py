@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import heapq
 import math
 import os
 import queue
+import stat
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-import numpy as np
 from pydantic import AwareDatetime
 
 from servoscope.core.errors import EmptyRecordingError, OutputError
@@ -25,9 +24,9 @@ from servoscope.core.messages import render
 from servoscope.core.settings import NonEmptyStr
 from servoscope.service.assets.reception import Reception
 from servoscope.service.config_types import Seconds
-from servoscope.service.log import log
-from servoscope.service.sources.block import Block, ResumePosition
+from servoscope.service.sources.block import ResumePosition
 from servoscope.service.sources.inbox import Inbox
+from servoscope.service.sources.log_decoder import LogDecoder
 from servoscope.service.sources.log_files import (
     FileNames,
     FileRows,
@@ -42,17 +41,18 @@ from servoscope.service.sources.log_files import (
 )
 from servoscope.service.sources.message import (
     POLL_S,
-    Content,
-    Decoder,
+    Backlog,
     InboxMessage,
     RejectionCounter,
     SourceAsset,
     ThreadTransport,
 )
+from servoscope.service.sources.share import Share
 
 DONE, FAILED = "done", "failed"  # subfolders that files are moved to
 MAX_CLOCK_DIFFERENCE_S = 3600.0  # between the file server and whoever writes the time stamps
 MAX_COMPARED = 1000  # files whose first time stamps are compared with each other
+MAX_HANDED_ROWS = 200_000  # rows of files that are read, and wait to be decoded
 MAX_REMEMBERED = 10_000  # contents by which a file that comes again is recognised
 MAX_CHANGE_S = 86400.0  # after which a file that was read is not looked at again
 MAX_ANSWER_S = 30.0  # that a share may take to answer
@@ -96,7 +96,7 @@ class FolderSettings(FolderNames):
     def create(self, name: str, assets: Mapping[str, SourceAsset], folder: Path) -> Inbox:
         """Return the source; raises ConfigError where nothing says of which asset a file is."""
         rejections = RejectionCounter()
-        decoder = LogDecoder(self, assets, rejections)
+        decoder = LogDecoder(self.block, partial(self.begin_times, assets), assets, rejections)
         return Inbox(FolderTransport(self, assets, folder / self.path), decoder, assets, rejections)
 
     def begin_times(self, assets: Iterable[str], resume: Mapping[str, ResumePosition]) -> dict[str, float]:
@@ -105,51 +105,6 @@ class FolderSettings(FolderNames):
         if isinstance(self.start, datetime):
             begin = self.start.timestamp()
         return {name: resume[name].last_t if name in resume else begin for name in assets}
-
-
-class LogDecoder(Decoder):
-    """Cuts the rows of files into blocks, those that were not counted before, whichever file they are in."""
-
-    def __init__(
-        self, settings: FolderSettings, assets: Mapping[str, SourceAsset], rejections: RejectionCounter
-    ) -> None:
-        self.settings, self._assets, self._rejections = settings, assets, rejections
-        self._counted: dict[str, float] = {}  # by asset, up to when its rows are in blocks [UTC s]
-        self._sequences: dict[str, int] = {}
-
-    def open(self, resume: Mapping[str, ResumePosition]) -> None:
-        """Begin; assets in `resume` continue behind the last row that was counted."""
-        self._counted = self.settings.begin_times(self._assets, resume)
-        self._sequences = {name: resume[name].sequence if name in resume else -1 for name in self._assets}
-
-    def decode(self, message: InboxMessage) -> Content:
-        """Return the blocks of the rows of a file that were not counted before, in the order of time."""
-        read: ReadFile = message.content
-        firsts = {name: self._first_new(name, rows) for name, rows in read.rows.items()}
-        total = sum(rows.samples.t.size for rows in read.rows.values())
-        new = total - sum(firsts.values())
-        log("info", "file read", file=read.file.name, rows=total, new=new)
-        if total and not new and read.is_new:
-            why = render(text("service.folder.late", file=read.file.name))
-            self._rejections.add(read.file.asset, "late", why)
-        streams = (self._cut_asset(name, read.rows[name], first) for name, first in firsts.items())
-        return Content(blocks=heapq.merge(*streams, key=lambda block: float(block.t[-1])))
-
-    def _first_new(self, name: str, rows: FileRows) -> int:
-        half_s = 0.5 / self._assets[name].loop.sample_rate
-        return int(np.searchsorted(rows.samples.t, self._counted[name] + half_s - rows.offset, side="right"))
-
-    def _cut_asset(self, name: str, rows: FileRows, first: int) -> Iterator[Block]:
-        asset, samples = self._assets[name], rows.samples
-        size = max(1, round(self.settings.block * asset.loop.sample_rate))
-        channels = [samples.channels[covariate] for covariate in asset.covariates]
-        for begin in range(first, samples.t.size, size):
-            columns = (samples.t, samples.r, samples.u, samples.y, *channels)
-            signals = np.stack([column[begin : begin + size] for column in columns])
-            signals[0] += rows.offset
-            self._sequences[name] += 1
-            self._counted[name] = float(signals[0, -1])
-            yield Block.from_signals(name, self._sequences[name], signals, time.monotonic())
 
 
 class FolderTransport(ThreadTransport):
@@ -163,7 +118,7 @@ class FolderTransport(ThreadTransport):
         super().__init__()
         self.settings, self._assets, self._folder = settings, assets, folder
         self._loops = {name: asset.loop for name, asset in assets.items()}
-        self._names = FileNames(settings, list(assets))
+        self._share, self._names = Share(folder), FileNames(settings, list(assets))
         self._resumed: dict[str, float] = {}  # by asset, up to when its rows had been counted [UTC s]
         # of the thread: files that may still change, those that were dealt with, and those that lay there at first;
         # contents by their digest; first time stamps [UTC s]
@@ -175,6 +130,9 @@ class FolderTransport(ThreadTransport):
         self._trouble = render(text("service.trouble.connecting"))
         self._asked_at = math.inf  # since when an answer of the share is waited for, by the monotonic clock [s]
         self._files_wait = True  # whether there are files that are complete, or soon will be
+        # files whose rows are ahead of our clock, and until when they wait [UTC s]
+        self._early: dict[str, tuple[FileVersion, float]] = {}
+        self._unread = list[float]()  # since when files that are complete wait, by the monotonic clock [s]
         self._stored = queue.SimpleQueue[ReadFile]()
 
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
@@ -196,6 +154,14 @@ class FolderTransport(ThreadTransport):
 
     def _describe_trouble(self, reason: str) -> str:
         return render(text("service.trouble.unreachable", reason=f"{self._folder}: {reason}"))
+
+    @property
+    def backlog(self) -> Backlog:  # type: ignore[override]
+        """The files that are complete and not yet stored."""
+        since, handed = self._unread, len(self.waiting)
+        oldest_s = time.monotonic() - min(since) if since else 0.0
+        words = text("service.folder.backlog", count=len(since) + handed, minutes=oldest_s / 60.0)
+        return Backlog(len(since) + handed, oldest_s, render(words) if oldest_s > self.settings.interval_s else "")
 
     @property
     def pause_s(self) -> float:  # type: ignore[override]
@@ -229,6 +195,7 @@ class FolderTransport(ThreadTransport):
                     next_look = time.monotonic() + self.settings.poll_s
                 if waiting:
                     self._read(waiting.popleft())
+                    self._unread = self._unread[1:]
                 self._move_stored()
             except (OSError, OutputError) as error:
                 self._trouble = self._describe_trouble(getattr(error, "strerror", None) or str(error))
@@ -277,15 +244,28 @@ class FolderTransport(ThreadTransport):
             before = self._changing.get(file.name) or IncompleteFile(file.version, now, now)
             since = before.unchanged_since if before.version == file.version else now
             changing[file.name] = IncompleteFile(file.version, since, before.seen_since)
-            is_old = time.time() - file.changed_at > MAX_CLOCK_DIFFERENCE_S
-            if is_old or now - since >= self.settings.complete_after_s:
+            version, until = self._early.get(file.name, (None, 0.0))
+            if (version != file.version or time.time() >= until) and self._is_complete(file, now - since):
                 complete.append(file)
         if self._first_names is None:
             self._first_names = set(changing)
-        first = sorted(complete, key=lambda file: file.name)[:MAX_COMPARED]
-        ordered = sorted(first, key=self._order) if len(first) > 1 else first
+        first = _take_turns(sorted(complete, key=lambda file: file.name))[:MAX_COMPARED]
+        ordered = _take_turns(sorted(first, key=self._order)) if len(first) > 1 else first
         self._changing, self._trouble = changing, ""
+        self._early = {name: early for name, early in self._early.items() if name in changing}
+        self._unread = sorted(changing[file.name].seen_since for file in complete)
         return ordered
+
+    def _is_complete(self, file: LogFile, unchanged_s: float) -> bool:
+        """Whether nothing more is to be expected of a file; a last line without an end waits once more as long."""
+        is_old = time.time() - file.changed_at > MAX_CLOCK_DIFFERENCE_S
+        settled_s = unchanged_s + self.settings.complete_after_s * is_old
+        if settled_s < self.settings.complete_after_s:
+            return False
+        try:
+            return settled_s >= 2.0 * self.settings.complete_after_s or not self._share.ends_within_line(file.name)
+        except OSError:  # what is wrong with it is told when it is read
+            return True
 
     def _order(self, file: LogFile) -> tuple[float, str]:
         """Return what files are sorted by: the first time stamp, and the name."""
@@ -323,9 +303,11 @@ class FolderTransport(ThreadTransport):
                 raise
             except Exception as error:  # readers of other packages raise what they like
                 failures = dict.fromkeys(assets, describe_error(error))
-        about = path.stat()
+        about = self._share.stat(file.name)
         if (about.st_size, about.st_mtime_ns) != file.version or (failures and self._digest(file) != digest):
             return  # it has changed meanwhile, and is read when it is complete
+        if self._is_early(file, rows):
+            return
         self._changing.pop(file.name, None)
         self._settled[file.name], self._digests[digest] = file.version, file.name
         if len(self._digests) > MAX_REMEMBERED:
@@ -338,15 +320,38 @@ class FolderTransport(ThreadTransport):
         self.asset_troubles = kept | {name: Reception("refused", why) for name, why in failures.items()}
         is_new = file.name not in (self._first_names or ())
         read = ReadFile(file, rows, is_new, FAILED if failures else DONE)
-        while self.waiting and not self._stop_event.wait(POLL_S):
+        while self._handed_rows() > MAX_HANDED_ROWS and not self._stop_event.wait(POLL_S):
             pass
         self.waiting.append(InboxMessage(file.name, read, time.monotonic(), partial(self._stored.put, read)))
+
+    def _handed_rows(self) -> int:
+        return sum(rows.samples.t.size for message in list(self.waiting) for rows in message.content.rows.values())
+
+    def _is_early(self, file: LogFile, rows: Mapping[str, FileRows]) -> bool:
+        """Whether a file has rows further ahead of our clock than allowed: it waits where it is until they are not.
+
+        Rows that were counted with such times would make all rows of the next files late.
+        """
+        now = time.time()
+        ends = {name: float(own.samples.t[-1]) + own.offset for name, own in rows.items()}
+        early = {name: s for name in ends if (s := ends[name] - now - self._assets[name].ahead_s) > 0.0}
+        if not early:
+            self._early.pop(file.name, None)
+            return False
+        longest_s = max(early.values())
+        why = render(text("service.folder.ahead", file=file.name, ahead_s=longest_s))
+        if file.name not in self._early:
+            for name in early:
+                self.rejections.add(name, "ahead", why)
+        self._early[file.name] = file.version, now + longest_s
+        self.asset_troubles = {**self.asset_troubles, **dict.fromkeys(early, Reception("refused", why))}
+        return True
 
     def _digest(self, file: LogFile) -> bytes:
         """Return what tells a file from others: its content, and what its name says; logs of machines at rest agree."""
         digest = hashlib.blake2b(f"{file.asset}\0{file.time}\0".encode(), digest_size=16)
-        with (self._folder / file.name).open("rb") as content:
-            while piece := content.read(PIECE_BYTES):
+        with self._share.file(file.name) as opened:
+            while piece := os.read(opened, PIECE_BYTES):
                 self._asked_at = time.monotonic()
                 digest.update(piece)
         return digest.digest()
@@ -357,15 +362,23 @@ class FolderTransport(ThreadTransport):
             read = self._stored.get()
             if self.settings.afterwards == "stay":
                 continue
-            path, target = self._folder / read.file.name, self._folder / read.subfolder / read.file.name
+            name = read.file.name
             try:
-                about = path.stat()
-                if (about.st_size, about.st_mtime_ns) != read.file.version:
+                about = self._share.stat(name)
+                if (about.st_size, about.st_mtime_ns) != read.file.version or not stat.S_ISREG(about.st_mode):
                     continue  # it has grown, and is read again
-                target.parent.mkdir(parents=True, exist_ok=True)
-                if target.exists():  # another one of that name
-                    target = target.with_name(f"{about.st_mtime_ns}-{target.name}")
-                path.rename(target)
+                other = f"{about.st_mtime_ns}-{name.rpartition('/')[2]}"  # where there is one of that name
+                self._share.move(name, f"{read.subfolder}/{name}", other)
             except OSError as error:
-                why = f"{path}: cannot be moved ({error.strerror})"
+                why = f"{self._folder / name}: cannot be moved to {read.subfolder} ({error.strerror})"
                 self.rejections.add(read.file.asset, "not moved", why)
+
+
+def _take_turns(files: Iterable[LogFile]) -> list[LogFile]:
+    """Return files so that each asset has its turn, those of one asset in the order in which they are."""
+    turns: dict[int, list[LogFile]] = defaultdict(list)
+    counts: dict[str, int] = defaultdict(int)
+    for file in files:
+        turns[counts[file.asset]].append(file)
+        counts[file.asset] += 1
+    return [file for turn in sorted(turns) for file in turns[turn]]
