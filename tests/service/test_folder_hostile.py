@@ -1,4 +1,4 @@
-"""A folder that others write to: early clocks, torn lines, links, odd names, and more files than can be read at once."""
+"""A folder that others write to: early clocks, torn lines, links, odd names, and a crowd of files."""
 
 from __future__ import annotations
 

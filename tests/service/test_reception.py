@@ -141,7 +141,7 @@ def service_of(folder: Path, text: str) -> Service:
 def test_the_example_of_the_page_loses_no_block(tmp_path: Path, broker: Mosquitto) -> None:
     service = service_of(tmp_path, example("mqtt.md", broker.port))
     running, sender = Running(service), Sender(broker.port)
-    until(lambda: not any(service.troubles.values()), 30.0)
+    until(lambda: not any(service.troubles["connection"].values()), 30.0)
     time.sleep(0.2)
     for k in range(60):
         sender.send(block(k, began=time.time() - 60.0))
@@ -149,7 +149,7 @@ def test_the_example_of_the_page_loses_no_block(tmp_path: Path, broker: Mosquitt
     press = service.assets["press"]
     until(lambda: press.heard and press.state is not None and press.state.position.blocks == 60, 30.0)
     assert press.state is not None and press.state.position.lost == 0
-    assert not any(service.troubles.values()) and service.degraded_reason == ""
+    assert not any(service.troubles["connection"].values()) and service.degraded_reason == ""
     sender.close()
     running.end(stop=True)
 
@@ -194,7 +194,7 @@ def test_an_action_for_connections_takes_those_of_all_sources() -> None:
     sinks = {"command": {"bell": {"argv": ["true"], "alarms": ["connection"]}}}
     alarms = AlarmSettings.model_validate({"connection": {"on_delay_s": 0.0}})
     notifier = Notifier("hall", alarms, ActionSettings.model_validate(sinks))
-    result = notifier.check_service(0.0, {"plant": "Not authorized", "plc": ""}, NOW)
+    result = notifier.check_service(0.0, {"connection": {"plant": "Not authorized", "plc": ""}}, NOW)
     assert [(one.alarm, one.cause) for one in result.transitions] == [("connection.plant", "Not authorized")]
     (row,) = notifier.notify(result.transitions, {}, NOW)
     assert row.table == "outbox" and row.values["event"]["alarm"] == "connection.plant"
@@ -203,7 +203,7 @@ def test_an_action_for_connections_takes_those_of_all_sources() -> None:
     resumed = Notifier("hall", AlarmSettings(definitions={}), ActionSettings())  # its definition has gone
     resumed.resume(notifier.checkpoint()["state"])
     assert active_alarms({"hall": {"status": resumed.status}}) == [{**shown, "priority": None}]
-    assert notifier.check_service(0.0, {"plant": ""}, NOW + 1.0).transitions == []
+    assert notifier.check_service(0.0, {"connection": {"plant": ""}}, NOW + 1.0).transitions == []
     assert set(notifier.status["alarms"]) == {"buffering", "connection.plant"}  # one that has no source is forgotten
 
 
@@ -251,7 +251,7 @@ def test_a_dead_broker_and_an_asset_that_never_comes_are_alarms_from_the_start(
 def test_the_table_of_somebody_who_has_just_connected_them(tmp_path: Path, broker: Mosquitto) -> None:
     service = service_of(tmp_path, example("mqtt.md", broker.port))  # it runs beside, and loses nothing to the visitor
     running, sender = Running(service), Sender(broker.port)
-    until(lambda: not any(service.troubles.values()), 30.0)
+    until(lambda: not any(service.troubles["connection"].values()), 30.0)
     (tmp_path / "visit.toml").write_text(
         (tmp_path / "hall.toml").read_text() + '[assets.lift]\nbaseline = "press.json"\nsource = "plant"\n'
     )
@@ -263,7 +263,7 @@ def test_the_table_of_somebody_who_has_just_connected_them(tmp_path: Path, broke
     assert press.split()[:3] == ["press", "plant", "followed"] and "100" in press
     assert lift.split()[:3] == ["lift", "plant", "unheard"] and "nothing has ever come" in " ".join(said.stdout.split())
     state = service.assets["press"].state
-    assert state is not None and state.position.lost == 0 and not any(service.troubles.values())
+    assert state is not None and state.position.lost == 0 and not any(service.troubles["connection"].values())
     refused = CliRunner().invoke(app, ["run", str(tmp_path / "hall.toml"), "--online"])
     assert isinstance(refused.exception, ConfigError) or refused.exit_code != 0
     sender.close()
