@@ -27,11 +27,15 @@ def test_the_proposal_is_the_machine_and_says_why(log: Path, tmp_path: Path) -> 
     loop = Loop.load(target)
     assert isinstance(loop.plant, AxisPlant)
     assert loop.plant.terms == ("viscous", "coulomb", "offset")
-    assert "axis: viscous, coulomb, offset" in told.out and "plants compared" in told.out
+    assert "axis: viscous, coulomb, offset" in told.out and told.out.count("\n") <= 25
+    assert told.out.count("servoscope learn") == 1
+    told = run("init", log, "-o", target, "--yes", "--details")
+    assert "plants compared" in told.out and "coherence r, u" in told.out
     assert loop.sample_rate == pytest.approx(GERMAN_RATE)
     assert loop.columns.output == "0.001 * `Istposition [mm]`" and loop.columns.time_unit == "ms"
     assert 0.2 < (loop.monitor.cutoff or 0.0) <= GERMAN_RATE / 10.0 and 5.0 <= loop.monitor.memory <= 10.0
     text = target.read_text(encoding="utf-8")
+    assert "#   axis: viscous, coulomb, offset: 99." in text and "plants compared" in text
     assert all("  # " in line for line in text.splitlines() if " = " in line)
     assert 'input = "Drehmoment [Nm]"' in text and "mm in the name, factor to SI units" in text
     assert run("inspect", log, "--loop", target).code == 0

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -16,14 +15,12 @@ from servoscope.cli.options import ReadingOptions, with_reading_options
 from servoscope.cli.output_paths import check_output
 from servoscope.cli.progress import show_steps
 from servoscope.core.errors import OutputError, ServoscopeError
-from servoscope.core.messages import render, say
+from servoscope.core.messages import say
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from servoscope.models.loop import Columns
-
-MAX_LISTED_PLANTS = 6
+    from servoscope.learning.loop_proposal import LoopProposal
 
 
 @app.command()
@@ -36,6 +33,10 @@ def init(
     *,
     reading: ReadingOptions,
     yes: Annotated[bool, typer.Option("--yes", help="Take what is proposed; ask nothing.")] = False,
+    kind: Annotated[
+        Literal["axis", "cylinder", "polynomial"] | None, typer.Option(help="Kind of the plant, where it is known.")
+    ] = None,
+    details: Annotated[bool, typer.Option("--details", help="Print all evidence: reasons, plants, logs.")] = False,
     urdf: Annotated[Path | None, typer.Option(metavar="FILE", help="Of a robot arm: its URDF.")] = None,
 ) -> None:
     """Look at logs, compare plants, propose a loop file with the evidence for each line, write it, inspect the logs."""
@@ -47,7 +48,7 @@ def init(
         return
 
     from servoscope.cli.render import results
-    from servoscope.learning.proposal import PART_ROWS, propose_columns
+    from servoscope.learning.proposal import PART_ROWS, propose_columns, propose_loop
     from servoscope.signals import readers
     from servoscope.signals.readers.axes import axes_of, moving_axes
     from servoscope.signals.readers.table import read_part
@@ -86,8 +87,11 @@ def init(
             if open_question and (chosen is None or not typer.confirm(say("init.confirm_columns"), default=True)):
                 chosen = propose_columns(log, channels, axis, typer.prompt(say("init.ask_columns")))
             assert chosen is not None, "it was proposed, or asked for"
-            with read_part(PART_ROWS) as part:
-                _propose(out, logs, chosen.model_copy(update=reader.changes), target, asks, reader.where)
+            with read_part(PART_ROWS) as part, show_steps(1, 1) as steps:
+                steps.begin(log.name)
+                columns = chosen.model_copy(update=reader.changes)
+                proposal = propose_loop(logs, columns, reader.where, kind=kind)
+            _print_and_save(out, proposal, target, asks, details, reader.where)
             cut = [say("init.part", log=name, rows=count) for name, count in part.cut.items()]
             results.print_notes(out, cut, "blue", "-")
     failures.exit_if_any()
@@ -98,47 +102,18 @@ def _axis_file(output: Path, axis: str | None) -> Path:
     return output.with_name(f"{output.stem}-{axis}{output.suffix}")
 
 
-def _propose(out: Console, logs: list[Path], columns: Columns, output: Path, asks: bool, where: dict[str, str]) -> None:
-    """Print the proposal for logs with its evidence, write it, and inspect the logs with it."""
+def _print_and_save(
+    out: Console, proposal: LoopProposal, output: Path, asks: bool, details: bool, where: dict[str, str]
+) -> None:
+    """Print the proposal with what is in doubt, write it, and print the next command."""
+    from servoscope.cli.render import proposal as rendered
     from servoscope.cli.render import results
-    from servoscope.learning import inspection
-    from servoscope.learning.proposal import propose_loop
-    from servoscope.signals import readers
 
-    with show_steps(1, 1) as steps:
-        steps.begin(logs[0].name)
-        proposal = propose_loop(logs, columns, where)
-    lines = [
-        (f"{line.section}.{line.key}".lstrip("."), line.value + " ?" * line.doubtful, render(line.why))
-        for line in proposal.lines
-    ]
-    results.print_table(out, ("setting", "proposed", "why"), lines, words=3)
-    compared = [(plant.words, f"{100.0 * plant.explained:.2f} %") for plant in proposal.candidates[:MAX_LISTED_PLANTS]]
-    results.print_table(out, ("plant", "explained of u"), compared)
-    notes = [say("init.compared", count=len(proposal.candidates)), *map(render, proposal.notes)]
-    if any(line.doubtful for line in proposal.lines):
-        notes.append(say("init.doubtful"))
-    results.print_notes(out, notes)
+    if details:
+        rendered.print_details(out, proposal)
+    rendered.print_proposal(out, proposal)
     if asks and any(line.doubtful for line in proposal.lines):
         typer.confirm(say("init.confirm"), default=True, abort=True)
     proposal.save(output)
     results.print_written_path(out, output)
-    usable = []
-    for log in logs:
-        try:
-            with show_steps(1, 1) as steps:
-                steps.begin(log.name)
-                inspected = inspection.inspect(readers.read(log, proposal.loop, where=where), proposal.loop)
-        except ServoscopeError:  # the notes say why
-            continue
-        results.print_inspection(out, inspected)
-        usable += [log] * (inspected.verdict != "not usable")
-    if usable:
-        learned = " ".join(shlex.quote(str(log)) for log in usable)
-        if where:
-            learned += " --where " + shlex.quote(",".join(f"{column}={value}" for column, value in where.items()))
-        results.print_command(
-            out, say("init.next"), f"servoscope learn {shlex.quote(str(output))} {learned} -o baseline.json"
-        )
-    else:
-        results.print_notes(out, [say("init.not_usable", loop=str(output))])
+    rendered.print_next(out, proposal, output, where)

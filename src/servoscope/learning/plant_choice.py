@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -13,7 +13,6 @@ import numpy.typing as npt
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import NotEnoughError
 from servoscope.learning.inspection import model_order, signals
-from servoscope.learning.inspection.inspect import motion_mask
 from servoscope.models.loop import Loop, MonitorSettings
 from servoscope.models.plants import cylinder, parse_plant
 from servoscope.models.plants.axis import TERMS
@@ -28,6 +27,7 @@ MIN_SHARE = 2e-5  # and of u
 MIN_TURNED_SHARE = 0.98  # of u, explained by a machine whose u counts the other way; level loops explain 0.95
 # share of u that each of these has to explain: they imitate what a sign that comes late leaves of friction
 IMITATORS = {"stiffness": 0.005, "stribeck": 0.005, "order 3": 0.005}
+SPEED_SHARE = 0.9  # share of u that the speed alone explains, where u sets a speed
 MIN_SINE_RANGE_RAD = 0.5  # half of the range of y [rad], from which a sine differs from a straight line
 STRIBECK_SHARE = 0.2  # of the rms speed, at which Stribeck friction may have fallen to a half
 MIN_ANGLE_RAD = 0.02  # off 0, from which it is said where a weight hangs
@@ -48,6 +48,7 @@ class PlantCandidate:
     coefficients: int
     plausible: bool  # whether inertia and frictions are positive, as far as the plant has them
     reversed: bool  # whether all of these are negative: u counts the other way
+    rival: str | None = None  # another kind of plant that explains as much, where u moves y at a speed of its own
 
     @property
     def worth(self) -> float:
@@ -79,9 +80,19 @@ class _Fold:
 
 
 def choose_plant(
-    recordings: Sequence[Recording], cutoff: float, is_speed: bool, rest_speed: float
+    recordings: Sequence[Recording],
+    cutoff: float,
+    is_speed: bool,
+    rest_speed: float,
+    *,
+    kind: str | None = None,
+    has_valve: bool = False,
+    may_be_speed: bool = False,
 ) -> tuple[PlantCandidate, ...]:
     """Return plants, the supported one first, the others by what they explain of u.
+
+    `kind`: of no other kind; `has_valve`: at a tie it is a cylinder, by what its u is called; `may_be_speed`: nothing
+    says that y is a position, and axes whose output is a speed are compared, too.
 
     Each is fitted by least squares to all folds but one and judged by that one (Stone, 1974). Of those that are worse
     than the best by no more than a standard error (Breiman, Friedman, Olshen and Stone, 1984), or by no more than what
@@ -119,20 +130,53 @@ def choose_plant(
     of_higher_order = [plant for plant in _polynomials(powers) if plant[0]["order"] > 2 - is_speed]
     plants += [(*plant, of_generic) for plant in of_higher_order]
     candidates = [candidate for plant in plants if (candidate := _judge(*plant)) is not None]
+    if may_be_speed:
+        candidates += _judge_speeds(axis, lambda plant: folds(_loop(rate, cutoff, plant)))
     if not is_speed:
         low, high = (pick([pick(recording.y) for recording in recordings]) for pick in (np.min, np.max))
         most = max((candidate.explained for candidate in candidates), default=0.0)
         contacts = [float(f"{low + share * (high - low):.3g}") for share in CONTACT_SHARES]
-        candidates += _judge_cylinders(lambda plant: folds(_loop(rate, cutoff, plant)), most, contacts)
+        wanted = has_valve or kind == "cylinder"
+        candidates += _judge_cylinders(lambda plant: folds(_loop(rate, cutoff, plant)), most, contacts, wanted)
+    candidates = [candidate for candidate in candidates if kind in (None, candidate.settings["kind"])]
+    supported = _choose(candidates, swings, has_valve)
+    others = sorted(candidates, key=lambda candidate: -candidate.explained)
+    rival = None if is_speed or kind is not None else _rival(supported, of_axis)
+    return replace(supported, rival=rival), *(candidate for candidate in others if candidate is not supported)
+
+
+def _judge_speeds(
+    axis: Mapping[str, object], folds: Callable[[Mapping[str, object]], list[_Fold]]
+) -> list[PlantCandidate]:
+    """Return axes whose output is a speed; without dry friction each is a polynomial of order 1 with stiffness."""
+    axis = {**axis, "y": "speed"}
+    made = folds(_rich_axis(axis, False, 0.0))
+    plants = [plant for plant in _axes(axis, False, 0.0) if "coulomb" in plant[0]["terms"]]
+    return [candidate for plant in plants if (candidate := _judge(*plant, made)) is not None]
+
+
+def _choose(candidates: Sequence[PlantCandidate], swings: bool, has_valve: bool) -> PlantCandidate:
+    """Return the plant that is proposed. Raises NotEnoughError where none of them is plausible."""
     plausible = [candidate for candidate in candidates if candidate.plausible]
     if not plausible:
         raise NotEnoughError("it moves too little to compare plants: record a longer motion, or more excitation")
     supported = _support(plausible, swings)
+    if has_valve:
+        cylinders = [other for other in plausible if other.settings["kind"] == "cylinder"]
+        if as_good := [other for other in cylinders if _is_as_good(other, supported)]:
+            supported = _support(as_good, swings)
     if "terms" not in supported.settings:  # perhaps because u counts the other way
         turned = [other for other in candidates if other.reversed and other.explained >= MIN_TURNED_SHARE]
         supported = _support([*plausible, *turned], swings)
-    others = sorted(candidates, key=lambda candidate: -candidate.explained)
-    return supported, *(candidate for candidate in others if candidate is not supported)
+    return supported
+
+
+def _rival(supported: PlantCandidate, of_axis: Sequence[_Fold]) -> str | None:
+    """Return the kind that a log of this plant can be of as well: a valve and a motor both set a speed."""
+    kinds = {"axis": "cylinder", "cylinder": "axis"}
+    by_speed = _judge({"kind": "axis"}, ("viscous_friction",), of_axis)
+    sets_speed = by_speed is not None and by_speed.plausible and by_speed.explained >= SPEED_SHARE
+    return kinds.get(str(supported.settings["kind"])) if sets_speed else None
 
 
 def _support(candidates: Sequence[PlantCandidate], swings: bool) -> PlantCandidate:
@@ -178,18 +222,19 @@ def _loop(rate: float, cutoff: float, plant: Mapping[str, object]) -> Loop:
 
 
 def _judge_cylinders(
-    folds: Callable[[Mapping[str, object]], list[_Fold]], explained: float, contacts: Sequence[float]
+    folds: Callable[[Mapping[str, object]], list[_Fold]], explained: float, contacts: Sequence[float], wanted: bool
 ) -> list[PlantCandidate]:
     """Return cylinders on which a spring acts; with a process force too, if that explains more than the others do.
 
-    Without a load that takes its part of the pressure, a cylinder is as good as an axis.
+    Without a load that takes its part of the pressure, a cylinder is as good as an axis, and judged if it is `wanted`.
     """
     judged: list[PlantCandidate] = []
     for contact in (None, *contacts):
         friction_settings = {} if contact is None else {"contact": contact}
         loads = ("spring",) if contact is None else ("spring", "process")
         made = folds({"kind": "cylinder", "terms": [*loads, "overlap", "offset"], **friction_settings})
-        for chosen in (list(loads), [*loads, "overlap"]):
+        unloaded: list[list[str]] = [[], ["overlap"]] if wanted and contact is None else []
+        for chosen in (*unloaded, list(loads), [*loads, "overlap"]):
             names = ("acceleration", *cylinder.BY_DIRECTION, *(cylinder.TERMS[term].coefficient for term in chosen))
             candidate = _judge({"kind": "cylinder", "terms": [*chosen, "offset"], **friction_settings}, names, made)
             judged += [] if candidate is None else [candidate]
@@ -299,4 +344,4 @@ def _rows_in_motion(recording: Recording, cutoff: float, is_speed: bool, rest_sp
     """Return where the output neither rests nor the filters remember a rest, shape (N,)."""
     g = model_order.form_regressors(recording, model_order.generic_loop(recording.sample_rate, cutoff))
     at_rest, _ = signals.detect_rest(recording, g.phi[:, 1 - is_speed], rest_speed / 3.0)
-    return g.ok & motion_mask(g, at_rest)
+    return g.ok & model_order.motion_mask(g, at_rest)

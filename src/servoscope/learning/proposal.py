@@ -5,23 +5,29 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from pydantic import ValidationError
 
-from servoscope.core import number_format
 from servoscope.core.errors import IrregularTimeError, LoopError, NotEnoughError, RecordingError, ServoscopeError
-from servoscope.core.files import atomic_write
-from servoscope.core.messages import Message, message, render
+from servoscope.core.messages import Message, message
 from servoscope.core.settings_errors import describe_error
 from servoscope.learning.inspection import Inspection, inspect
-from servoscope.learning.inspection.rules import GOOD_EXPLAINED_SHARE, MIN_MEMORIES, advised_rest_speed
+from servoscope.learning.inspection.cutoff import measure_cutoff
+from servoscope.learning.loop_proposal import LoopProposal, ProposalLine, quoted
+from servoscope.learning.monitor_proposal import hold_at_rest, monitor_lines, monitor_settings
 from servoscope.learning.plant_choice import PlantCandidate, choose_plant
-from servoscope.models.loop import Columns, Loop, MonitorSettings
-from servoscope.models.plants import plant_class
+from servoscope.learning.plant_proposal import (
+    choose_learnable,
+    names_no_position,
+    names_valve,
+    plant_lines,
+    with_pressures,
+)
+from servoscope.models.loop import Columns, Loop
 from servoscope.signals import Recording
 from servoscope.signals.readers import ChannelInfo, list_channels, read
 from servoscope.signals.readers.axes import axes_of, own_clock, signal_names, signals_of_one_axis
@@ -30,7 +36,6 @@ from servoscope.signals.readers.formats import open_file
 from servoscope.signals.readers.guess_columns import (
     FIELDS,
     guess_mapping,
-    guess_pressures,
     mapping_template,
     names_speed,
     names_target_torque,
@@ -43,7 +48,6 @@ from servoscope.signals.readers.units import split_unit
 from servoscope.signals.readers.wrap import find_wrap
 
 PART_ROWS = 400_000  # of a log, that are looked at; more are read in whole chunks
-MAX_MEMORY_S, MIN_PERIODS = 5.0, 5.0  # of the estimator; periods of the cutoff that it holds at least
 JITTER_PERCENT = 5.0  # of a sample: standard deviation of the steps above which rows are resampled
 SPEED_AXIS = {"kind": "axis", "y": "speed", "terms": ["viscous", "coulomb", "offset"]}
 # what may move the healthy coefficients, by what its name contains
@@ -54,47 +58,6 @@ COVARIATE_STEMS = {
 }
 MIN_SLOW_SHARE = 0.5  # of the variance of a covariate, that lies between memories: what is faster follows the motion
 MAX_SPAN_RATIO = 8.0  # of r over y, or y over r, beyond which one of them is in another unit
-
-
-@dataclass(frozen=True)
-class ProposalLine:
-    """A key of the loop file, its value as TOML, and why it is proposed; `doubtful`: somebody has to confirm it."""
-
-    section: str
-    key: str
-    value: str
-    why: Message
-    doubtful: bool = False
-
-
-@dataclass(frozen=True)
-class LoopProposal:
-    """A loop with the lines of its file, the plants that were compared, the proposed one first, and what to know."""
-
-    loop: Loop
-    lines: tuple[ProposalLine, ...]
-    candidates: tuple[PlantCandidate, ...]
-    notes: tuple[Message, ...]
-    origin: str  # the log that it was made from
-
-    def __str__(self) -> str:
-        return self.to_toml()
-
-    def save(self, path: str | Path) -> None:
-        """Write the loop file with the reasons as comments; raises OutputError if that fails."""
-        atomic_write(Path(path), self.to_toml().encode())
-
-    def to_toml(self) -> str:
-        """Return the loop file with comments."""
-        written = [f"# {render(message('init.origin', log=self.origin))}"]
-        section = ""
-        for line in self.lines:
-            if line.section != section:
-                section = line.section
-                written += ["", f"[{section}]"]
-            written.append(f"{line.key} = {line.value}".ljust(40) + f"  # {render(line.why)}")
-        # names of columns and files may hold what neither a string nor a comment of TOML may
-        return "".join(re.sub(r"[\0-\x1f\x7f]", lambda sign: f"\\u{ord(sign[0]):04X}", line) + "\n" for line in written)
 
 
 def propose_columns(
@@ -135,68 +98,114 @@ def propose_columns(
         raise LoopError(f"columns: {describe_error(error, Columns)}") from None
 
 
-def propose_loop(paths: Sequence[Path], columns: Columns, where: Mapping[str, str] | None = None) -> LoopProposal:
+def propose_loop(
+    paths: Sequence[Path],
+    columns: Columns,
+    where: Mapping[str, str] | None = None,
+    *,
+    kind: str | None = None,
+    is_speed: bool | None = None,
+) -> LoopProposal:
     """Return a loop for logs whose columns are known, as `inspect` measures the first of them; `where`: as in `read`.
 
-    Logs that do not go with the first are left out, with a note. RecordingError: the first is unreadable, or at rest.
+    `kind`: of the plant, where it is known; `is_speed`: whether y is a speed, by its name where that is not said. Logs
+    that do not go with the first are left out, with a note. What is proposed was tried: `learn` does not refuse it.
+
+    Raises RecordingError: the first is unreadable, or at rest; nothing explains u; too few samples can be used.
     """
-    path, others = paths[0], paths[1:]
+    path = paths[0]
     columns, wraps = _unwrapped_columns(path, columns, where)
-    is_speed = names_speed(columns.outputs[0])
-    columns, recording, inspection = _read_evenly(path, columns, where, is_speed)
-    if inspection.best_order is None or inspection.suggested_cutoff_hz is None:
-        raise RecordingError(f"{path}: {inspection.summary}")
-    rate = float(f"{recording.sample_rate:.6g}")
-    # the largest of two digits that the recommendation allows
-    resampled = next((defect.text.values["cutoff"] for defect in recording.defects if defect.kind == "resampled"), None)
-    cutoff = number_format.round_down(
-        min(inspection.suggested_cutoff_hz, resampled if isinstance(resampled, float) else math.inf)
-    )
-    memory = max(MIN_PERIODS / cutoff, min(MAX_MEMORY_S, recording.duration_s / MIN_MEMORIES))
-    memory = number_format.round_down(memory)
-    frequencies = [f for f in MonitorSettings().frequencies if f <= cutoff] or [float(f"{cutoff / 2.0:.2g}")]
-    monitor: dict[str, object] = {"cutoff": cutoff, "memory": memory, "frequencies": frequencies}
-    settings = {"sample_rate": rate, "columns": columns.model_dump(exclude_none=True) | {"time": columns.time}}
+    by_values, is_speed = is_speed is not None, names_speed(columns.outputs[0]) if is_speed is None else is_speed
+    columns, read_logs, inspection, bands, notes = _read_logs(paths, columns, where, is_speed)
+    recordings = [log for _, log in read_logs]
+    recording = recordings[0]
+    monitor = monitor_settings(recording, bands)
+    settings: dict[str, object] = _settings(recording, columns)
 
     def loop_of(plant: Mapping[str, object]) -> Loop:
         return Loop.from_dict({**settings, "plant": plant, "monitor": monitor}, source=str(path))
 
-    recordings, notes = [recording], []
-    for other in others:
-        try:
-            recordings.append(read(other, loop_of({"kind": "polynomial", "order": 2}), where=where))
-        except ServoscopeError as error:
-            notes.append(message("init.left_out", reason=str(error)))
-    assert inspection.rest is not None, "what has an order has moved"
     try:
-        candidates = choose_plant(recordings, cutoff, is_speed, inspection.rest.speed)
-    except NotEnoughError as error:
+        candidates = _compare_plants(recordings, columns, inspection, loop_of, is_speed, kind)
+        if candidates[0].reversed and not re.search(r" [+-] |^-", columns.input):
+            turned = columns.model_copy(update={"input": turned_channel(columns.input)})
+            return propose_loop(paths, turned, where, kind=kind, is_speed=is_speed if by_values else None)
+        if not is_speed and candidates[0].settings.get("y") == "speed":
+            return propose_loop(paths, columns, where, kind=kind, is_speed=True)
+        chosen, odd = choose_learnable(candidates, loop_of, recordings)
+    except (NotEnoughError, RecordingError) as error:
         raise RecordingError(f"{path}: {error}") from None
-    if candidates[0].reversed and not re.search(r" [+-] |^-", columns.input):
-        return propose_loop(paths, columns.model_copy(update={"input": turned_channel(columns.input)}), where)
-    chosen = _with_pressures(candidates[0], path, columns)
+    chosen = with_pressures(chosen, path, columns)
+    if odd is not None:
+        settings["implausible"] = "note"
+    inspected = inspect(recording, loop_of(chosen.settings))
+    held = hold_at_rest(inspected, monitor, lambda: loop_of(chosen.settings), recordings)
     loop = loop_of(chosen.settings)
-    held = []
-    if (speed := advised_rest_speed(inspect(recording, loop), loop)) is not None:
-        speed = float(f"{speed:.2g}")
-        monitor |= {"update_when": "moving", "rest_speed": speed}
-        loop = loop_of(chosen.settings)
-        held = [
-            ProposalLine("monitor", "update_when", '"moving"', message("init.update_when")),
-            ProposalLine("monitor", "rest_speed", repr(speed), message("init.rest_speed")),
-        ]
-    further, told = _further_columns(path, columns, where, max(round(memory * rate), 1))
+    further, told = _further_columns(path, columns, where, max(round(loop.monitor.memory * loop.sample_rate), 1))
     lines = (
-        ProposalLine("", "sample_rate", repr(rate), message("init.rate", samples=recording.samples)),
+        ProposalLine("", "sample_rate", repr(loop.sample_rate), message("init.rate", samples=recording.samples)),
+        *([] if odd is None else [ProposalLine("", "implausible", '"note"', message("init.odd", reason=odd), True)]),
         *_column_lines(path, columns, wraps, recording),
         *further,
-        *_plant_lines(chosen),
-        ProposalLine("monitor", "cutoff", repr(cutoff), message("init.cutoff")),
-        ProposalLine("monitor", "memory", repr(memory), message("init.memory", length=recording.duration_s)),
-        ProposalLine("monitor", "frequencies", repr(frequencies), message("init.frequencies")),
+        *plant_lines(chosen, by_values),
+        *monitor_lines(monitor, recording.duration_s),
         *held,
     )
-    return LoopProposal(loop, lines, candidates, (*notes, *told), path.name)
+    if chosen.rival is not None:
+        notes.append(message("init.rival", kind=chosen.rival, plant=str(chosen.settings["kind"])))
+    others = (other for other in candidates if other.words != chosen.words)
+    inspections = [(log, inspect(rec, loop)) for log, rec in read_logs[not held :]]
+    inspections = inspections if held else [(path, inspected), *inspections]
+    return LoopProposal(loop, lines, (chosen, *others), (*notes, *told), path.name, tuple(inspections))
+
+
+def _compare_plants(
+    recordings: Sequence[Recording],
+    columns: Columns,
+    inspection: Inspection,
+    loop_of: Callable[[Mapping[str, object]], Loop],
+    is_speed: bool,
+    kind: str | None,
+) -> tuple[PlantCandidate, ...]:
+    """Return the plants that are compared, with what the names of the columns say of them."""
+    assert inspection.rest is not None, "what has an order has moved"
+    return choose_plant(
+        recordings,
+        loop_of({"kind": "polynomial", "order": 1}).cutoff,
+        is_speed,
+        inspection.rest.speed,
+        kind=kind,
+        has_valve=names_valve(columns),
+        may_be_speed=not is_speed and names_no_position(columns),
+    )
+
+
+def _settings(recording: Recording, columns: Columns) -> dict[str, object]:
+    """Return the part of a loop file that is not chosen."""
+    rate = float(f"{recording.sample_rate:.6g}")
+    return {"sample_rate": rate, "columns": columns.model_dump(exclude_none=True) | {"time": columns.time}}
+
+
+def _read_logs(
+    paths: Sequence[Path], columns: Columns, where: Mapping[str, str] | None, is_speed: bool
+) -> tuple[Columns, list[tuple[Path, Recording]], Inspection, list[float], list[Message]]:
+    """Return the logs, what `inspect` measures of the first, the cutoffs of all, and what was left out."""
+    columns, recording, inspection = _read_evenly(paths[0], columns, where, is_speed)
+    if inspection.best_order is None or inspection.suggested_cutoff_hz is None:
+        raise RecordingError(f"{paths[0]}: {inspection.summary}")
+    monitor = monitor_settings(recording, [inspection.suggested_cutoff_hz])
+    plant = {"kind": "polynomial", "order": 1}
+    loop = Loop.from_dict({**_settings(recording, columns), "plant": plant, "monitor": monitor})
+    logs, bands, notes = [(paths[0], recording)], [inspection.suggested_cutoff_hz], []
+    for path in paths[1:]:
+        try:
+            further = read(path, loop, where=where)
+        except ServoscopeError as error:
+            notes.append(message("init.left_out", reason=str(error)))
+            continue
+        logs.append((path, further))
+        bands.append(measure_cutoff(further, is_speed))
+    return columns, logs, inspection, bands, notes
 
 
 def _read_evenly(
@@ -220,27 +229,6 @@ def _inspect(recording: Recording, is_speed: bool) -> Inspection:
     if not is_speed:
         return inspect(recording)
     return inspect(recording, Loop.from_dict({"sample_rate": recording.sample_rate, "plant": SPEED_AXIS}))
-
-
-def _with_pressures(chosen: PlantCandidate, path: Path, columns: Columns) -> PlantCandidate:
-    """Return a plant with the columns of pressures, where it takes some and the log has them."""
-    takes = "pressures" in plant_class(chosen.settings["kind"]).model_fields
-    pressures = guess_pressures([channel.name for channel in list_channels(path, columns.text)]) if takes else None
-    return chosen if pressures is None else replace(chosen, settings={**chosen.settings, "pressures": pressures})
-
-
-def _plant_lines(chosen: PlantCandidate) -> list[ProposalLine]:
-    """Return the section on the plant; constant forces are part of each."""
-    share = chosen.explained
-    explained = message("init.explained", share=100.0 * share)
-    lines = []
-    for key, value in chosen.settings.items():
-        why = explained if key == "kind" else message(f"init.of_{key}")
-        written = json.dumps(value, ensure_ascii=False)
-        if isinstance(value, Mapping):
-            written = f"{{{', '.join(f'{name} = {_quoted(text)}' for name, text in value.items())}}}"
-        lines.append(ProposalLine("plant", key, written, why, key == "kind" and share < GOOD_EXPLAINED_SHARE))
-    return lines
 
 
 def _further_columns(
@@ -275,7 +263,7 @@ def _further_columns(
             notes.append(message("init.moves", name=name))
     if not slow:
         return [], notes
-    value = ", ".join(f"{_quoted(key)} = {_quoted(quoted_channel(name))}" for key, name in slow.items())
+    value = ", ".join(f"{quoted(key)} = {quoted(quoted_channel(name))}" for key, name in slow.items())
     return [ProposalLine("columns", "# covariates", f"{{{value}}}", message("init.covariates"))], notes
 
 
@@ -284,6 +272,7 @@ def init(
     columns: Columns | str | None = None,
     *,
     where: Mapping[str, str] | None = None,
+    kind: str | None = None,
 ) -> LoopProposal:
     """Propose a loop from logs: columns, units, sample rate, plant, cutoff and memory, each with its evidence.
 
@@ -296,6 +285,8 @@ def init(
         names.
     where
         Rows to take, as for `read`.
+    kind
+        Kind of the plant, where it is known: ``"axis"``, ``"cylinder"`` or ``"polynomial"``.
 
     Returns
     -------
@@ -314,7 +305,7 @@ def init(
     with read_part(PART_ROWS) as part:
         if not isinstance(columns, Columns):
             columns = propose_columns(paths[0], list_channels(paths[0]), given=columns)
-        proposal = propose_loop(paths, columns, where)
+        proposal = propose_loop(paths, columns, where, kind=kind)
     cut = (message("init.part", log=name, rows=rows) for name, rows in part.cut.items())
     return replace(proposal, notes=(*proposal.notes, *cut))
 
@@ -352,14 +343,14 @@ def _column_lines(path: Path, columns: Columns, wraps: Mapping[str, float], reco
         if _counts_seconds(columns, recording):  # a counter, or another unit, that nobody names
             told = message("init.time_counts", step=1.0 / recording.sample_rate), True
         why = message("init.row_rate" if columns.row_rate else "init.column")
-        lines = [ProposalLine("columns", "time", _quoted(columns.time), why)]
-        lines += [ProposalLine("columns", "time_unit", _quoted(columns.time_unit), *told)] * (columns.row_rate is None)
+        lines = [ProposalLine("columns", "time", quoted(columns.time), why)]
+        lines += [ProposalLine("columns", "time_unit", quoted(columns.time_unit), *told)] * (columns.row_rate is None)
     without = columns.reference == Columns().reference and columns.reference not in open_file(path, columns.text).known
     spans = [float(np.ptp(x[np.isfinite(x)])) for x in (recording.r, recording.y)]
     for key, texts in (("reference", (columns.reference,)), ("input", (columns.input,)), ("output", columns.outputs)):
         unit = split_unit(texts[0].rpartition("* ")[2].strip("`"))[1]
         why = message("init.column_unit", unit=unit) if unit else message("init.column_plain")
-        value = _quoted(texts[0]) if len(texts) == 1 else f"[{', '.join(map(_quoted, texts))}]"
+        value = quoted(texts[0]) if len(texts) == 1 else f"[{', '.join(map(quoted, texts))}]"
         if key in wraps:
             why = message("init.wraps", range=wraps[key])
         doubtful = (not unit and key == "output") or key in wraps
@@ -384,7 +375,3 @@ def _counts_seconds(columns: Columns, recording: Recording) -> bool:
     """Tell whether the clock is one of whole numbers without a unit, at most one a second."""
     plain = columns.time_unit == "s" and not split_unit(columns.time or "")[1] and recording.began is None
     return plain and recording.sample_rate <= 1.0 and not np.any(recording.t % 1.0)
-
-
-def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)

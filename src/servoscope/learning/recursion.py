@@ -23,6 +23,7 @@ from servoscope.evidence.warm_up import fit_warm_up
 from servoscope.fit.tuning import TuningFit, fit_tuning
 from servoscope.learning.instrument import learn_instrument, learns_instrument
 from servoscope.models.loop import Loop
+from servoscope.models.lti import settling_samples
 from servoscope.signals import Recording
 
 SPEED_OVER = 0.05  # s over which a speed is measured here
@@ -96,10 +97,22 @@ def tune_pipeline(loop: Loop, recordings: Sequence[Recording]) -> tuple[Pipeline
     for rec, g in zip(recordings, regressions, strict=True):
         if (usable := int(g.ok.sum())) < fewest:
             raise NotEnoughError(
-                f"{rec.name}: only {usable} usable samples of at least {fewest} when filters have settled and rest is "
-                "left out: record longer, lower rest_speed, or learn without it"
+                f"{rec.name}: only {usable} usable samples of at least {fewest} {_what_to_change(loop)}"
             )
     return pipeline, regressions, fit_tuning(pipeline, regressions)
+
+
+def _what_to_change(loop: Loop) -> str:
+    """Return what took the samples of a recording away, and which keys of the loop file change that."""
+    rate = loop.sample_rate
+    settled = f"when filters have settled for {settling_samples(loop.cutoff, 4, 1.0 / rate) / rate:.3g} s"
+    longer = "record longer, raise cutoff"
+    match loop.monitor.update_when:
+        case "moving":
+            return f"{settled} and rest is left out: {longer}, lower rest_speed, or learn without it"
+        case "auto":
+            return f'{settled} and rest is left out: {longer}, or write update_when = "always" under [monitor]'
+    return f"{settled}: {longer}"
 
 
 def _tune(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from servoscope.core.arrays import FloatArray
 from servoscope.learning.inspection.signals import InspectionModel
@@ -30,6 +31,7 @@ class Spectra:
     # shape (F,)
     coherence_u: FloatArray
     coherence_y: FloatArray
+    length: int  # of the segments [samples]
 
 
 class Band(InspectionModel):
@@ -62,9 +64,7 @@ def spectra(recording: Recording, period: int | None = None) -> Spectra | None:
     `period`: of the reference, in samples: segments of that length keep the power of its lines from leaking between
     them, where it would look like noise.
     """
-    starts = np.flatnonzero(recording.restart)
-    stretches = list(zip(starts, np.append(starts[1:], recording.samples), strict=True))
-    sizes = np.array([stop - start for start, stop in stretches])
+    sizes = np.array([stop - start for start, stop in _stretches(recording)])
     length = _length(sizes, recording.samples)
     few = max(MAX_PERIODS_PER_SEGMENT, MIN_SEGMENT_SAMPLES // (period or 1))
     whole = (period or 0) * max(1, min(length // (period or 1), few))
@@ -72,27 +72,39 @@ def spectra(recording: Recording, period: int | None = None) -> Spectra | None:
         length = whole
     if length < 16:
         return None
+    X = windowed_segments(recording, np.stack([recording.r, recording.u, recording.y]), length)
+    if len(X) < MIN_SEGMENTS:
+        return None
     window = np.hanning(length + 1)[:-1]
     scale = 2.0 / (recording.sample_rate * float(window @ window))
-    signals = np.stack([recording.r, recording.u, recording.y])
-    rows = []
-    for start, stop in stretches:
-        for begin in range(start, stop - length + 1, length // 2):
-            part = signals[:, begin : begin + length]
-            rows.append(np.fft.rfft((part - part.mean(axis=1, keepdims=True)) * window, axis=1))
-    if len(rows) < MIN_SEGMENTS:
-        return None
-    X = np.stack(rows)[:, :, 1:]  # (segments, 3, F), without the mean
     power = scale * np.mean(np.abs(X) ** 2, axis=0)
     cross = scale * np.mean(np.conj(X[:, :1]) * X[:, 1:], axis=0)
     floor = SILENT_POWER_SHARE * power.max(axis=1, keepdims=True) + 1e-150
     raw = np.abs(cross) ** 2 / (np.maximum(power[:1], floor[:1]) * np.maximum(power[1:], floor[1:]))
     # Half-overlapping Hann segments hold about 0.9 independent ones each; noise alone shows 1/K.
-    K = max(0.9 * len(rows), 2.0)
+    K = max(0.9 * len(X), 2.0)
     coherence = np.clip((K * raw - 1.0) / (K - 1.0), 0.0, 1.0)
     coherence[:, power[0] <= floor[0]] = 0.0
     f = np.arange(1, length // 2 + 1) * recording.sample_rate / length
-    return Spectra(f, *power, *coherence)
+    R, U, Y = power
+    return Spectra(f, R, U, Y, coherence[0], coherence[1], length)
+
+
+def windowed_segments(recording: Recording, signals: FloatArray, length: int) -> npt.NDArray[np.complex128]:
+    """Return the Fourier transforms of half overlapping segments of signals (S, N) without their means, (K, S, F)."""
+    window = np.hanning(length + 1)[:-1]
+    rows = []
+    for start, stop in _stretches(recording):
+        for begin in range(start, stop - length + 1, length // 2):
+            part = signals[:, begin : begin + length]
+            rows.append(np.fft.rfft((part - part.mean(axis=1, keepdims=True)) * window, axis=1)[:, 1:])
+    return np.stack(rows) if rows else np.zeros((0, len(signals), length // 2), dtype=np.complex128)
+
+
+def _stretches(recording: Recording) -> list[tuple[int, int]]:
+    """Return the first row of each stretch between gaps, and the one after its last."""
+    starts = np.flatnonzero(recording.restart).tolist()
+    return list(zip(starts, [*starts[1:], recording.samples], strict=True))
 
 
 def _length(sizes: np.ndarray[tuple[int], np.dtype[np.int64]], samples: int) -> int:
@@ -123,10 +135,9 @@ def usable_band(s: Spectra) -> Band | None:
 def information_edge(s: Spectra, noise: float, sample_rate: float) -> float:
     """Return up to which frequency [Hz] y stands out of its own white noise by a factor of ten in power."""
     clear = 10.0 * 2.0 * noise**2 / sample_rate < s.Y
-    # Lines that fail one by one, between those of a multisine, do not end it.
-    share = np.cumsum(clear) / np.arange(1, clear.size + 1)
-    good = np.flatnonzero(clear & (share >= 0.5))
-    return float(s.f[good[-1]]) if good.size else float(s.f[0])
+    # a sine fills three lines of these windows, noise rarely does; what lies between the sines does not end the band
+    good = 1 + np.flatnonzero(clear[:-2] & clear[1:-1] & clear[2:])
+    return float(s.f[good[-1] + 1]) if good.size else float(s.f[0])
 
 
 def coherence_and_snr(s: Spectra, frequency: float) -> tuple[float, float, float]:

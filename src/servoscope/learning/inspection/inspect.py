@@ -15,6 +15,7 @@ from servoscope.core.short_repr import ShortRepr
 from servoscope.estimation.reference_period import reference_period
 from servoscope.learning.inspection import delay, excitation, model_order, signals, simulation_fit
 from servoscope.learning.inspection import residual as leftover
+from servoscope.learning.inspection.cutoff import suggest_cutoff
 from servoscope.learning.inspection.excitation import FrequencyExcitation, Spectra
 from servoscope.learning.inspection.model_order import RegressionFit, Regressors
 from servoscope.learning.inspection.result import Coefficient, InspectionMeasurements, InverseModelFit, describe_order
@@ -40,7 +41,6 @@ from servoscope.signals.recording import thin_out
 
 MAX_ROWS = 250_000  # that are analysed: more take memory and time, and show little more
 MIN_STRETCH_ROWS = 30_000  # of which a longer recording's consist
-MIN_USED_SHARE = 0.1  # share of the samples that must be left when rest is left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,23 +165,23 @@ def _measure_with_model(
     """Add spectra and all that needs a model."""
     period = reference_period(recording)
     spectra = excitation.spectra(recording, period)
-    periods = recording.samples / period if period is not None else None
-    m = m.model_copy(update={"periods": periods})
+    m = m.model_copy(update={"periods": recording.samples / period if period is not None else None})
     judged = spectra if m.coherent else None
-    nothing, rate = np.zeros(0), recording.sample_rate
-    traces = InspectionTraces(recording, spectra, nothing, nothing.astype(np.bool_), nothing)
+    rate = recording.sample_rate
+    traces = InspectionTraces(recording, spectra, np.zeros(0), np.zeros(0, dtype=np.bool_), np.zeros(0))
     noise = signals.white_noise_std(recording.y, recording.restart, m.quantisation[2].step)
     band = excitation.usable_band(spectra) if spectra is not None else None
-    suggested = _suggested_cutoff(spectra, band.high_hz if band else None, noise, rate)
+    derivative = 0 if loop is None else loop.plant.derivative
+    suggested = suggest_cutoff(recording, spectra, noise, derivative > 0)
     cutoff = loop.cutoff if loop is not None else suggested
     # Variance of white noise behind a second-order differentiator, and behind the filter's own s F(s).
     sign_rate = 2.0 * math.pi * min(model_order.FAST_SIGN, rate / 4.0)
     own_rate = 2.0 * math.pi * cutoff
     generic = model_order.generic_loop(rate, cutoff, 3.0 * noise * math.sqrt(sign_rate**3 / (4.0 * rate)))
     g = model_order.form_regressors(recording, generic)
-    v = g.phi[:, 1 if loop is None else 1 - loop.plant.derivative]
+    v = g.phi[:, 1 - derivative]
     at_rest, rest_speed = signals.detect_rest(recording, v, noise * math.sqrt(own_rate**3 / (32.0 * rate)))
-    moving = motion_mask(g, at_rest)
+    moving = model_order.motion_mask(g, at_rest)
     block = settling_samples(cutoff, 4, 1.0 / rate)
     orders, best = model_order.select_order(g, g.ok & moving, block)
     m = m.model_copy(
@@ -237,24 +237,6 @@ def _check_delay(estimate: delay.Delay, recording: Recording, loop: Loop | None,
     samples, half = exact.seconds * rate, 1.96 * exact.std_s * rate
     gain = estimate.gain if exact.significant else 0.0
     return delay.Delay.within(samples, samples - half, samples + half, rate, estimate.configured_samples, gain)
-
-
-def _suggested_cutoff(spectra: Spectra | None, coherent: float | None, noise: float, rate: float) -> float:
-    """Return a tenth of the sample rate, or up to where y is more than noise and follows r, if less."""
-    if spectra is None:
-        return rate / 10.0
-    edge = min(rate / 10.0, excitation.information_edge(spectra, noise, rate), coherent or math.inf)
-    return float(f"{min(max(edge, 4.0 * float(spectra.f[0])), rate / 10.0):.3g}")
-
-
-def motion_mask(g: Regressors, at_rest: BoolArray) -> BoolArray:
-    """Return where neither the output rests nor the filters remember a rest, if enough is left then."""
-    last = np.where(at_rest, np.arange(at_rest.size), -g.bank.wait - 1)
-    moving = np.arange(at_rest.size) - np.maximum.accumulate(last) > g.bank.wait
-    for mask in (moving, ~at_rest):
-        if (g.ok & mask).sum() >= max(MIN_USED_SHARE * at_rest.size, 100):
-            return np.asarray(mask)
-    return np.ones_like(at_rest)
 
 
 def _summarise_fit(

@@ -21,6 +21,7 @@ from servoscope.signals import Recording
 
 MIN_ORDER_GAIN = 0.02  # share of the unexplained variance that one more power of s must take away
 MIN_FRICTION_GAIN = 0.2  # and that Coulomb friction must: its sign is never quite right
+MIN_USED_SHARE = 0.1  # share of the samples that must be left when rest is left out
 FAST_SIGN = 50.0  # Hz, of the differentiator behind sign(y')
 
 
@@ -88,6 +89,16 @@ def form_regressors(recording: Recording, loop: Loop, delay: float | None = None
     recursion = Recursion([constants])
     rows, said = recursion.regressors(recursion.start()[0], recording.r, u, recording.y, recording.restart)
     return Regressors(loop, bank, rows[:, 0], rows[:, 1 : 1 + bank.n], said == USED)
+
+
+def motion_mask(g: Regressors, at_rest: BoolArray) -> BoolArray:
+    """Return where neither the output rests nor the filters remember a rest, if enough is left then."""
+    last = np.where(at_rest, np.arange(at_rest.size), -g.bank.wait - 1)
+    moving = np.arange(at_rest.size) - np.maximum.accumulate(last) > g.bank.wait
+    for mask in (moving, ~at_rest):
+        if (g.ok & mask).sum() >= max(MIN_USED_SHARE * at_rest.size, 100):
+            return np.asarray(mask)
+    return np.ones_like(at_rest)
 
 
 def fit_regression(
