@@ -106,7 +106,7 @@ def _files(folder: Path, recording: Recording) -> list[Target]:
     columns = {name: np.asarray(getattr(recording, name)) for name in "truy"}
     made = {"CSV": "csv", "Parquet": "parquet", "MAT 5": "mat", "MAT 7.3": "mat", "MDF": "mf4", "TDMS": "tdms"}
     made |= {"HDF5": "h5", "Excel": "xlsx", "LVM": "lvm", "MCAP": "mcap", "ULog": "ulg", "gzip": "csv.gz", "ZIP": "zip"}
-    made |= {"JSON": "jsonl", "Feather": "feather", "NumPy": "npz", "SQLite": "db", "trace": "trace"}
+    made |= {"JSON": "jsonl", "Feather": "feather", "NumPy": "npz", "SQLite": "db", "trace": "trace", "ROS 1": "bag"}
     writing: dict[str, Callable[[Path], object]] = {
         "MAT 5": lambda path: _mat(path, columns),
         "MAT 7.3": lambda path: _hdf5(path, columns),
@@ -117,6 +117,7 @@ def _files(folder: Path, recording: Recording) -> list[Target]:
         "LVM": lambda path: path.write_text(_lvm(columns)),
         "MCAP": lambda path: _mcap(path, columns),
         "ULog": lambda path: path.write_bytes(_ulog(columns)),
+        "ROS 1": lambda path: _bag(path, columns),
         "trace": lambda path: path.write_text(_trace(columns)),
         "gzip": lambda path: path.write_bytes(gzip.compress(_text(columns).encode())),
         "ZIP": lambda path: _zip(path, columns),
@@ -126,7 +127,8 @@ def _files(folder: Path, recording: Recording) -> list[Target]:
         "SQLite": lambda path: _sqlite(path, columns),
     }
     found = []
-    clocked = {".mf4", ".mcap", ".ulg", ".lvm"}  # whose readers make a column called time
+    named = dict.fromkeys((".mf4", ".mcap", ".bag", ".ulg", ".lvm"), Columns(time="time"))  # by their readers
+    named[".trace"] = Columns(time="time [ms]", time_unit="ms")
     for kind, suffix in made.items():
         path = folder / f"{kind.replace(' ', '-')}.{suffix}"
         writing.get(kind, lambda path: writers.write_table(path, columns))(path)
@@ -134,7 +136,7 @@ def _files(folder: Path, recording: Recording) -> list[Target]:
         def feed(data: bytes, _: random.Random, path: Path = path) -> str:
             path.write_bytes(data)
             readers.list_channels(path)
-            readers.read(path, columns=Columns(time="time") if path.suffix in clocked else None)
+            readers.read(path, columns=named.get(path.suffix))
             return "read"
 
         def show(data: bytes, path: Path = path) -> str:
@@ -217,6 +219,20 @@ def _sheet(path: Path, columns: dict[str, Any]) -> None:
         for k, name in enumerate("truy"):
             sheet.write(0, k, name)
             sheet.write_column(1, k, columns[name])
+
+
+def _bag(path: Path, columns: dict[str, Any]) -> None:
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    kind = "rig_msgs/msg/State"
+    store.register(get_types_from_msg("float64 r\nfloat64 u\nfloat64 y\n", kind))
+    with Writer(path) as writer:
+        topic = writer.add_connection("/axis", kind, typestore=store)
+        for t, r, u, y in zip(*(columns[name] for name in "truy"), strict=True):
+            data = store.serialize_ros1(store.types[kind](r=r, u=u, y=y), kind)
+            writer.write(topic, round(1e9 * (BEGAN + t)), data)
 
 
 def _trace(columns: dict[str, Any]) -> str:

@@ -59,7 +59,7 @@ def test_a_log_beside_a_name_column_is_no_long_table(tmp_path: Path) -> None:
         ("x.npz", b"PK\x03\x04 torn", "no plain arrays"),
         ("x.feather", b"ARROW1 torn", "damaged Feather"),
         ("x.db", b"SQLite format 3\0 torn", "damaged SQLite"),
-        ("x.bag", b"#ROSBAG V2.0\n", "rosbags-convert"),
+        ("x.bag", b"#ROSBAG V2.0\n", "damaged bag"),
         ("x.db3", b"plain text", "is not SQLite"),
     ],
 )
@@ -89,6 +89,8 @@ def test_a_bag_without_definitions_says_how_to_convert_it(tmp_path: Path) -> Non
     with closing(sqlite3.connect(tmp_path / "x.db3")) as bag, bag:
         bag.execute("CREATE TABLE topics(id INTEGER, name TEXT, type TEXT, serialization_format TEXT)")
         bag.execute("CREATE TABLE messages(id INTEGER, topic_id INTEGER, timestamp INTEGER, data BLOB)")
+        bag.execute("INSERT INTO topics VALUES (1, '/axis', 'rig_msgs/msg/State', 'cdr')")
+        bag.execute("INSERT INTO messages VALUES (1, 1, 0, x'00')")
     assert "ros2 bag convert" in refusal(tmp_path / "x.db3")
 
 

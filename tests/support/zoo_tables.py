@@ -159,13 +159,18 @@ def _(path: Path) -> None:
 def _(path: Path) -> None:
     kind = "float64 reference\nfloat64 effort\nfloat64 position\n"
     with closing(sqlite3.connect(path)) as bag, bag:
-        bag.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
+        bag.execute("CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT)")
+        bag.execute("INSERT INTO schema VALUES (4, 'jazzy')")
+        bag.execute(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT,"
+            " offered_qos_profiles TEXT, type_description_hash TEXT)"
+        )
         bag.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)")
         bag.execute(
             "CREATE TABLE message_definitions(id INTEGER PRIMARY KEY, topic_type TEXT, encoding TEXT,"
             " encoded_message_definition TEXT, type_description_hash TEXT)"
         )
-        bag.execute("INSERT INTO topics VALUES (1, '/axis', 'rig_msgs/msg/State', 'cdr')")
+        bag.execute("INSERT INTO topics VALUES (1, '/axis', 'rig_msgs/msg/State', 'cdr', '', '')")
         bag.execute("INSERT INTO message_definitions VALUES (1, 'rig_msgs/msg/State', 'ros2msg', ?, '')", (kind,))
         for t, *values in zip(*columns(), strict=True):
             data = b"\0\1\0\0" + struct.pack("<3d", *values)

@@ -103,6 +103,7 @@ class _Clock(NamedTuple):
     offsets: list[float]
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # of stamps that are none, which no clock fits
 def uniform_stamps(t: FloatArray, begins: IndexArray, signals: Sequence[npt.NDArray[np.float64]]) -> FloatArray | None:
     """Return the stamps of the uniform clock that all logged ones lie within half a last digit of, shape (N,).
 
@@ -221,7 +222,9 @@ def _fitted_period(t: FloatArray, run: _Run, digits: _Digits) -> float:
 
 def _nice_periods(period: float) -> list[float]:
     """Return periods next to one, those of a round rate or of few digits first."""
-    nice = []
+    nice = list[float]()
+    if not np.isfinite([period, 1.0 / period if period > 0.0 else np.inf]).all():
+        return nice
     for digits in range(1, NICE_DIGITS + 1):
         nice += [1.0 / float(f"{1.0 / period:.{digits}g}"), float(f"{period:.{digits}g}")]
     return [*dict.fromkeys(nice), period]

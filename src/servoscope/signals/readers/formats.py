@@ -67,7 +67,8 @@ BUILT_IN = {
         (".h5 .hdf5", "HDF5", "mat", "open_hdf5", "", "", True),
         (".xlsx .xls .ods", "Excel", "programs", "open_sheet", "python_calamine", "formats", True),
         (".lvm", "LVM", "programs", "open_lvm", "lvm_read", "formats", True),
-        (".mcap", "MCAP", "topics", "open_mcap", "mcap_ros2", "formats", True),
+        (".mcap", "MCAP", "topics", "open_bag", "rosbags", "formats", True),
+        (".bag", "bag of ROS 1", "topics", "open_bag", "rosbags", "formats", True),
         (".ulg", "ULog", "topics", "open_ulog", "pyulog", "formats", True),
         (".json .jsonl .ndjson", "JSON", "records", "open_json", "", "", True),
         (".feather .arrow .ipc", "Feather", "records", "open_feather", "", "", True),
@@ -160,9 +161,6 @@ def _open_plain(path: Path, text: TextLayout | None) -> TableFile:
         if other is None:
             kind = _recognise(head)
             what = f", it looks like a {kind}" if kind else ""
-            if kind == "bag of ROS 1":
-                convert = f"rosbags-convert --src {path.name} --dst {path.stem} --dst-storage mcap"
-                raise RecordingError(f"{path}: is a bag of ROS 1, convert it: pip install rosbags, then {convert}")
             known = ", ".join(readable_suffixes())
             raise RecordingError(f"{path}: unknown kind of file {path.suffix!r}{what}; readable are {known}")
         opener: Callable[[Path], TableFile] = other.load()

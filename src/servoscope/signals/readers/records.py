@@ -7,6 +7,7 @@ import sqlite3
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -16,6 +17,7 @@ import pyarrow as pa
 import pyarrow.feather as pf
 import pyarrow.json as pj
 
+from servoscope.core.errors import RecordingError
 from servoscope.signals.readers.matrices import MAX_ARRAY_LENGTH, flatten_table, split_matrices
 from servoscope.signals.readers.table import CHUNK_ROWS, TableFile, check_width, one_line_errors
 from servoscope.signals.readers.topics import open_bag
@@ -81,7 +83,7 @@ def open_sqlite(path: Path) -> TableFile:
     with one_line_errors(*damaged), closing(_connect(path)) as database:
         names = [str(row[0]) for row in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
         if {"topics", "messages"} <= set(names):
-            return open_bag(path, database)
+            return _open_bag(path)
         tables = {name: _column_names(database, name) for name in names if not name.startswith("sqlite_")}
     tables = {name: columns for name, columns in tables.items() if len(columns) > 1}
     places = {
@@ -102,6 +104,14 @@ def open_sqlite(path: Path) -> TableFile:
 
     groups = tuple(tuple(name for name, (table, _) in places.items() if table == label) for label in tables)
     return TableFile(path, tuple(places), read_chunks, channel_groups=groups)
+
+
+def _open_bag(path: Path) -> TableFile:
+    if find_spec("rosbags") is None:
+        raise RecordingError(f"{path}: bags of ROS need rosbags, pip install 'servoscope[formats]'")
+    if path.suffix.lower() != ".db3":
+        raise RecordingError(f"{path}: is a bag of ROS 2, rename it to {path.stem}.db3")
+    return open_bag(path)
 
 
 def _connect(path: Path) -> sqlite3.Connection:

@@ -1,10 +1,9 @@
-"""Logs of robots and vehicles, bags of ROS 2 and ULog of PX4: each topic is a raster with its own time."""
+"""Logs of robots and vehicles, bags of ROS 1 and 2 and ULog of PX4: each topic is a raster with its own time."""
 
 from __future__ import annotations
 
-import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
-from importlib.util import find_spec
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,59 +14,44 @@ from servoscope.core.errors import RecordingError
 from servoscope.signals.readers.matrices import MAX_ARRAY_LENGTH
 from servoscope.signals.readers.table import TableFile, check_width, one_line_errors
 
+CONVERT = "convert it to MCAP: ros2 bag convert -i FILE -o OPTIONS.yaml, with storage_id: mcap"
 MAX_VALUES = 200_000_000  # of all topics together, which are held in memory
 
 Topics = Mapping[str, Mapping[str, npt.NDArray[Any]]]
 
 
-def open_mcap(path: Path) -> TableFile:
-    """Open an MCAP file with messages of ROS 2; ``/joint_states.position[0]`` is a field of a topic.
+def open_bag(path: Path) -> TableFile:
+    """Open a bag of ROS 1 (``.bag``) or ROS 2 (``.mcap``, ``.db3``); ``/joint_states.position[0]`` is a field.
 
-    Arrays of a message with as many names have fields by name, too: ``/joint_states.position[elbow]``.
-
-    The time of a message is its header's stamp where it has one, else when it was logged.
+    Arrays of a message with as many names have fields by name, too: ``/joint_states.position[elbow]``. The time of a
+    message is its header's stamp where it has one, else when it was logged. Bags of ROS 2 before Iron hold no
+    definitions of their messages: those of Humble are taken, which know the kinds of ROS itself only.
     """
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
 
-    with one_line_errors(path, "is a damaged MCAP file", "record it again"), path.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        decoded = ((channel.topic, m.log_time, message) for _, channel, m, message in reader.iter_decoded_messages())
+    damaged = one_line_errors(path, "is a damaged bag, or one with messages that it does not define", CONVERT)
+    with damaged, AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
+        unknown = {connection.msgtype for connection in bag.connections} - {*bag.typestore.types}
+        if unknown:
+            raise RecordingError(f"{path}: does not define its messages {', '.join(sorted(unknown))}, {CONVERT}")
+        decoded = (
+            (connection.topic, logged, bag.deserialize(data, connection.msgtype))
+            for connection, logged, data in bag.messages()
+        )
         return _open_messages(path, decoded)
 
 
-def open_bag(path: Path, database: sqlite3.Connection) -> TableFile:
-    """Open a bag of ROS 2 in SQLite (``.db3``) that holds the definitions of its messages, as those of Iron on do."""
-    if find_spec("mcap_ros2") is None:
-        raise RecordingError(f"{path}: bags of ROS 2 need mcap_ros2, pip install 'servoscope[formats]'")
-    from mcap.records import Schema
-    from mcap_ros2.decoder import DecoderFactory
-
-    convert = "convert it to MCAP: ros2 bag convert -i FILE -o OPTIONS.yaml, with storage_id: mcap"
-    if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'").fetchone():
-        raise RecordingError(f"{path}: a bag without the definitions of its messages (ROS 2 before Iron), {convert}")
-    with one_line_errors(path, "is a damaged bag", convert):
-        texts = dict(database.execute("SELECT topic_type, encoded_message_definition FROM message_definitions"))
-        topics = database.execute("SELECT id, name, type FROM topics").fetchall()
-        factory: Any = DecoderFactory()
-        decoders: dict[int, tuple[str, Any]] = {}
-        for number, topic, kind in topics:
-            schema = Schema(id=number, name=kind, encoding="ros2msg", data=texts[kind].encode())
-            decoders[number] = topic, factory.decoder_for("cdr", schema)
-        rows = database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp")
-        return _open_messages(path, ((decoders[n][0], at, decoders[n][1](data)) for n, at, data in rows))
-
-
 def _open_messages(path: Path, messages: Iterable[tuple[str, int, Any]]) -> TableFile:
-    """Return the numbers in messages of ROS 2: topic, time of the log [ns], and the message."""
+    """Return the numbers in messages of ROS: topic, time of the log [ns], and the message."""
     rows: dict[str, list[dict[str, float]]] = {}
     count = 0
     for topic, logged, decoded in messages:
-        fields = dict(_message_fields(decoded))
-        stamp = [fields.pop(f"header.stamp.{part}", 0.0) for part in ("sec", "nanosec")]
+        numbers = dict(_message_fields(decoded))
+        stamp = [numbers.pop(f"header.stamp.{part}", 0.0) for part in ("sec", "nanosec")]
         seconds = stamp[0] + 1e-9 * stamp[1] if any(stamp) else 1e-9 * logged
-        rows.setdefault(topic, []).append({"time": seconds, **fields})
-        count += len(fields)
+        rows.setdefault(topic, []).append({"time": seconds, **numbers})
+        count += len(numbers)
         if count > MAX_VALUES:
             raise RecordingError(f"{path}: holds more than {MAX_VALUES} values, leave topics out")
     topics = {}
@@ -80,7 +64,7 @@ def _open_messages(path: Path, messages: Iterable[tuple[str, int, Any]]) -> Tabl
 def _message_fields(message: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, float]]:
     """Walk the numbers of a message."""
     labels = getattr(message, "name", None)  # of joints: their order may differ between messages
-    for name in getattr(message, "__slots__", ()):
+    for name in (field.name for field in fields(message)):
         value = getattr(message, name)
         if isinstance(value, bool | int | float):
             yield f"{prefix}{name}", float(value)
@@ -91,9 +75,9 @@ def _message_fields(message: Any, prefix: str = "", depth: int = 0) -> Iterator[
                     if own:
                         yield f"{prefix}{name}[{own[index]}]", float(item)
                     yield f"{prefix}{name}[{index}]", float(item)
-                elif depth < 4:
+                elif depth < 4 and is_dataclass(item):
                     yield from _message_fields(item, f"{prefix}{name}[{index}].", depth + 1)
-        elif depth < 4 and not isinstance(value, str | bytes):
+        elif depth < 4 and is_dataclass(value):
             yield from _message_fields(value, f"{prefix}{name}.", depth + 1)
 
 
