@@ -74,6 +74,7 @@ BUILT_IN = {
         (".feather .arrow .ipc", "Feather", "records", "open_feather", "", "", True),
         (".npz .npy", "NumPy", "records", "open_numpy", "", "", True),
         (".trace", "trace", "traces", "open_trace"),
+        (".halscope", "halscope log", "traces", "open_halscope"),
         (".db .sqlite .sqlite3 .db3", "SQLite", "records", "open_sqlite", "", "", True),
     )
     for suffix in suffixes.split()
@@ -100,6 +101,8 @@ MAGIC = {
     b"\x93NUMPY": "NumPy",
     b"SQLite format 3": "SQLite",
     b"[key]": "trace",
+    b"# Sampling period is": "halscope log",
+    b"Sampling period is": "halscope log",
     b"#ROSBAG V": "bag of ROS 1",
 }
 COMPATIBLE_KINDS = {
@@ -151,8 +154,8 @@ def _open_plain(path: Path, text: TextLayout | None) -> TableFile:
     reader = BUILT_IN.get(suffix)
     if reader is not None and reader.format == "CSV" and head.lstrip()[:1] == b"{" and b"}" in head:
         reader = BUILT_IN[".json"]  # many programs write records as lines of a log
-    if reader is not None and reader.format == "CSV" and _recognise(head.lstrip(b"\xef\xbb\xbf")) == "trace":
-        reader = BUILT_IN[".trace"]
+    if reader is not None and reader.format == "CSV" and (kind := _recognise(head.lstrip(b"\xef\xbb\xbf"))):
+        reader = {"trace": BUILT_IN[".trace"], "halscope log": BUILT_IN[".halscope"]}.get(kind, reader)
     if reader is not None:
         _check_format(path, head, reader.format)
         opened = reader.open(path, text)

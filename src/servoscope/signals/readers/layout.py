@@ -120,17 +120,21 @@ def _is_pure(row: Sequence[str], numeric: Sequence[int]) -> bool:
 def _rows_above(rows: Sequence[Sequence[str]], first: int, width: int) -> list[list[str]]:
     """Return the rows right above the table that may say what its columns are, the nearest first."""
     above: list[list[str]] = []
+    index = ""  # name of the first column, which frames of pandas with several rows of names have in a row of its own
     for row in reversed(rows[:first]):
         cells = list(row)
         while len(cells) > width and not cells[-1]:
             cells.pop()
         if not cells and not above:
             continue  # a blank line between header and rows
+        if not above and not index and width > 2 and len(cells) == width and [c for c in cells if c] == cells[:1]:
+            index = cells[0]
+            continue
         lacking = width - len(cells)
         # a preamble has another width; a row of names may lack the last, where lines end in a delimiter
         if not cells or lacking < 0 or lacking > 1 or sum(map(bool, cells)) < min(2, width):
             break
-        above.append(cells + [""] * lacking)
+        above.append([cells[0] or index, *cells[1:]] + [""] * lacking)
     return above
 
 

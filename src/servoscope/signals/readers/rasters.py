@@ -58,7 +58,10 @@ def join_rasters(
     Each raster is resampled to the target's rate, or to that of the raster of the output. `held`: the channels of u.
     Raises RecordingError if a raster has no time column, or they do not overlap.
     """
+    if len(opened.channel_groups) < 2:
+        return None
     clocks = raster_clocks(opened)
+    wanted, held, output = ({opened.aliases.get(name, name) for name in names} for names in (wanted, held, output))
     channels = [name for name in opened.columns if name in wanted and name not in clocks.values()]
     groups = _split(channels, opened.channel_groups)
     if len(groups) < 2:

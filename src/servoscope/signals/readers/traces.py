@@ -1,4 +1,4 @@
-"""Traces of CODESYS and of controllers that are built on it, ctrlX among them: one block of rows per variable."""
+"""Traces of controllers that are text but no table: those of CODESYS and ctrlX, and of halscope of LinuxCNC."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from servoscope.signals.readers.table import TableFile, one_line_errors
 
 KEY = re.compile(r"\s*(\d+)\.(\w+)\s*;\s*(.*?)\s*;?\s*")
 ROW = re.compile(r"\s*;\s*([^;]+?)\s*;\s*([^;]+?)\s*;?\s*")
+PERIOD = re.compile(r"#? ?Sampling period is (\d+) n")
 WORDS = {"true": 1.0, "false": 0.0}
 
 
@@ -53,3 +54,24 @@ def open_trace(path: Path) -> TableFile:
 def _number(cell: str) -> float:
     word = WORDS.get(cell.lower())
     return float(cell.replace(",", ".")) if word is None else word
+
+
+def open_halscope(path: Path) -> TableFile:
+    """Open a log of halscope of LinuxCNC; its first line has the sampling period, of which the time is made.
+
+    Its rows are values under a line of names, or, of earlier versions, name and value by turns.
+    """
+    lines = path.read_text("utf-8-sig", errors="replace").splitlines()
+    begun = PERIOD.match(lines[0]) if lines else None
+    body = [line for line in lines[1:] if line.strip() and not line.startswith("#")]
+    if begun is None or not body:
+        raise RecordingError(f"{path}: is a log of halscope without samples, write it again")
+    with one_line_errors(path, "is a damaged log of halscope", "write it again", (ValueError, IndexError)):
+        if ";" in body[0]:
+            names, cells = body[0].split(";"), [line.split(";") for line in body[1:]]
+        else:
+            names, cells = body[0].split()[0::2], [line.split()[1::2] for line in body]
+        values = np.array([[float(cell) for cell in row] for row in cells]).reshape(-1, len(names))
+    check_names(names, str(path))
+    time = 1e-9 * int(begun[1]) * np.arange(len(values))
+    return TableFile.from_columns(path, {"time": time, **{name: values[:, k] for k, name in enumerate(names)}})
