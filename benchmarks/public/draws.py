@@ -160,6 +160,7 @@ def main() -> None:
     command = parser(__doc__)
     command.add_argument("--set", choices=list(SETS), action="append", help="only this machine")
     command.add_argument("--draws", type=int, default=24, help="random draws of each number of recordings")
+    command.add_argument("--learned", type=int, action="append", help="only so many recordings")
     command.add_argument("--half", choices=("tuning", "judged"), help="only this half of the draws")
     given = parse_with_data(command, "real/qube")
     numbers = range(given.draws)
@@ -168,7 +169,7 @@ def main() -> None:
     rows, values = [], dict[str, str]()
     for name in given.set or SETS:
         machines = list(SETS[name](given.data))
-        for learned in LEARNED:
+        for learned in given.learned or LEARNED:
             counts = Counts()
             for machine in machines:
                 if len(machine.healthy) - learned >= MIN_JUDGED:

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from servoscope.core.errors import AlarmError, ConfigError, RecordingError, StateError
 from servoscope.core.messages import text_message
+from servoscope.core.verdict import VerdictKind
 from servoscope.diagnosis.monitor import Monitor
-from servoscope.diagnosis.result import Verdict
 from servoscope.diagnosis.schedule import DiagnosisSchedule
 from servoscope.service.alarms import AlarmSettings, LifecycleEvent, LifecycleState, OperatorCommand
 from servoscope.service.assets import checkpoint
@@ -158,14 +158,14 @@ class TestCheckpoint:
                 asset().resume(replace(checkpoint.unpack_state(packed, "press"), **change), [])
 
 
-def result(verdict: Verdict, onset: float | None = None, **values: Any) -> StoredDiagnosis:
+def result(verdict: VerdictKind, onset: float | None = None, **values: Any) -> StoredDiagnosis:
     return StoredDiagnosis(verdict=verdict, headline=text_message("words"), onset=onset, **values)
 
 
 class TestJudging:
     settings, schedule = DiagnosisSettings(window_s=40.0, every_s=100.0), DiagnosisSchedule(40.0, 10.0)
 
-    def course(self, exceeded: list[bool], verdict: Verdict = "healthy") -> list[int]:
+    def course(self, exceeded: list[bool], verdict: VerdictKind = "healthy") -> list[int]:
         """Return at which seconds there was an examination that says the verdict."""
         state, looked = ExaminationState(due=1e9, verdict="healthy"), []
         for t, above in enumerate(exceeded):

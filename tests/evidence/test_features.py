@@ -257,17 +257,18 @@ class TestVerdicts:
     def test_what_no_coefficient_shows_is_found_and_told_where(self, baseline: ss.Baseline) -> None:
         alone = ss.diagnose(baseline.model_copy(update={"features": None}), axis(200, ripple=0.15))
         found = ss.diagnose(baseline, axis(200, ripple=0.15))
-        assert (alone.verdict, found.verdict) == ("healthy", "fault")
+        assert (alone.verdict, found.verdict) == ("healthy", "suspect")
+        assert ss.diagnose(baseline, axis(200, ripple=0.15), before="suspect").verdict == "fault"
         assert not found.faults and found.candidates[0].name == "unknown"
         assert "while r rises, between" in found.summary and "times as large as in the healthy" in found.summary
         low, high = (float(found.summary.split(" Hz")[0].split("between ")[1].split(" and ")[i]) for i in (0, 1))
         assert low < 15.0 < high
         assert found.explanation[-2].startswith("u and the tracking error have both grown: air in the oil")
-        assert "14.3 % of all cases" in found.explanation[-1]  # 1/7 is all that six recordings can guarantee
+        assert found.explanation[-1].startswith("At most 1 in 7 healthy")  # all that six recordings can guarantee
 
     def test_a_coefficient_comes_first_and_features_stand_beside_it(self, baseline: ss.Baseline) -> None:
         found = ss.diagnose(baseline, axis(201, level=-0.3))
-        assert found.verdict == "fault" and found.onset_s is not None
+        assert found.verdict in ("suspect", "fault") and found.onset_s is not None
         assert found.explanation[0].startswith("Alarm at") and "while r falls" in found.explanation[-2]
 
     def test_motion_that_was_never_seen_is_no_evidence(self, baseline: ss.Baseline) -> None:
@@ -367,7 +368,9 @@ def test_a_ball_screw_without_grease_at_minus_40_kgf(shared_data: Path) -> None:
     baseline = ss.learn(loop, runs["normal"][:5])
     assert [ss.diagnose(baseline, run).verdict for run in runs["normal"][5:]] == ["healthy"] * 5
     for name in ("backlash2", "lackLubrication1"):
-        assert [ss.diagnose(baseline, run).verdict for run in runs[name]] == ["fault"] * 10
+        told = ss.diagnose(baseline, runs[name])  # one is unlike the healthy ones, two in a row are a fault
+        assert all(one.verdict in ("suspect", "fault") for one in told)
+        assert [one.verdict for one in told[1:]] == ["fault"] * 9
 
 
 def test_a_window_counts_once() -> None:

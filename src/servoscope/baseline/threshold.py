@@ -99,6 +99,18 @@ def robust_limit(left_out: Sequence[float], false_alarms: float, prior: ScorePri
     return float(np.exp(mean + quantile * score_std(left_out, prior)))
 
 
+def score_evidence(score: float, left_out: Sequence[float], prior: ScorePrior = WIDE_PRIOR) -> float:
+    """Return the evidence of a recording's score against healthy [nats]: ``-ln p``, distributed as in `score_limit`.
+
+    Few healthy recordings allow little: p has the tail of Student's t.
+    """
+    from scipy import special
+
+    mean, _ = _robust_mean(left_out, prior)
+    t = (float(np.log(max(score, MIN_SCORE))) - mean) / score_std(left_out, prior)
+    return -float(np.log(max(special.stdtr(len(left_out) - 1.0 + prior.degrees, -t), np.finfo(np.float64).tiny)))
+
+
 def score_std(left_out: Sequence[float], prior: ScorePrior = WIDE_PRIOR) -> float:
     """Return the standard deviation of the logarithm of a further healthy recording's score around their mean."""
     n = len(left_out)

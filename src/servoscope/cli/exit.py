@@ -21,7 +21,7 @@ SERVICE_MODULES = (
     "msgspec",
     "httpx",
 )  # what `servoscope[service]` brings, on which its commands are built
-EXIT_INPUT, EXIT_FAULT, EXIT_INTERRUPTED = 1, 3, 130  # exit codes; 2 is the command line's
+EXIT_INPUT, EXIT_FAULT, EXIT_SUSPECT, EXIT_INTERRUPTED = 1, 3, 4, 130  # exit codes; 2 is the command line's
 
 
 class CommandGroup(typer.core.TyperGroup):

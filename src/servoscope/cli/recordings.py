@@ -11,7 +11,7 @@ from servoscope.cli import arguments, arm
 from servoscope.cli.app import app
 from servoscope.cli.arguments import RecordingReader
 from servoscope.cli.baseline import AfterOption, add_recordings
-from servoscope.cli.exit import EXIT_FAULT, EXIT_INPUT, FailureCounter, print_json
+from servoscope.cli.exit import EXIT_FAULT, EXIT_INPUT, EXIT_SUSPECT, FailureCounter, print_json
 from servoscope.cli.options import (
     JsonOption,
     ReadingOptions,
@@ -27,6 +27,7 @@ from servoscope.core.messages import say
 
 if TYPE_CHECKING:
     from servoscope.baseline.baseline import Baseline
+    from servoscope.core.verdict import VerdictKind
     from servoscope.signals import Recording
 
 
@@ -252,10 +253,15 @@ def diagnose(
     as_json: JsonOption = False,
     report: ReportOption = None,
     trace: TraceOption = None,
-    fail_on_fault: Annotated[bool, typer.Option("--fail-on-fault", help="Exit with 3 if there is a fault.")] = False,
+    fail_on_fault: Annotated[
+        bool, typer.Option("--fail-on-fault", help="Exit with 3 after a fault, 4 after a suspect.")
+    ] = False,
     details: Annotated[bool, typer.Option("--details", "-v", help="Print the statistics behind it too.")] = False,
 ) -> None:
-    """Say whether the actuator was healthy; if not, what changed, by how much, since when, and how sure."""
+    """Say whether the actuator was healthy; if not, what changed, by how much, since when, and how sure.
+
+    Several recordings are given in order of time: one that is suspect after another one is a fault.
+    """
     recordings = arguments.expand_files(recordings)
     inputs = [baseline, *recordings]
     check_output(report, "--report", REPORTS, inputs, folder=True)
@@ -281,7 +287,8 @@ def diagnose(
     several = reader.expects_several(recordings)
     pages = OutputPaths.from_option(report, ".html", several, inputs)
     traces = OutputPaths.from_option(trace, ".parquet", several, inputs)
-    out, failures, faulty = results.create_console(), FailureCounter(), False
+    out, failures = results.create_console(), FailureCounter()
+    verdicts: list[VerdictKind] = []
     with show_steps(len(recordings), 3 + len(learned.loop.plant.all_faults) + len(learned.learned)) as steps:
         for path in recordings:
             steps.begin(path.name)
@@ -289,11 +296,13 @@ def diagnose(
                 for recording in reader.read(path):
                     with failures.catch():
                         steps.advance("recursion")
+                        before = verdicts[-1] if verdicts else "undetermined"
                         if traces is None and pages is None:
-                            result, course = diagnose_recording(learned, recording, steps.advance), None
+                            result = diagnose_recording(learned, recording, steps.advance, before=before)
+                            course = None
                         else:
-                            result, course = diagnose_with_trace(learned, recording, steps.advance)
-                        faulty |= result.verdict == "fault"
+                            result, course = diagnose_with_trace(learned, recording, steps.advance, before=before)
+                        verdicts.append(result.verdict)
                         if as_json:
                             result = result.model_copy(update={"provenance": provenance(whole, recording)})
                         with steps.pause():
@@ -312,8 +321,10 @@ def diagnose(
                             origin = plain_values.provenance(at, baseline, path)
                             page = result, course, recording, at.loop, origin
                             pages.write(path, recording.name, write_diagnosis_page, *page, stderr=as_json)
-    if fail_on_fault and faulty:
+    if fail_on_fault and "fault" in verdicts:
         raise typer.Exit(EXIT_FAULT)
+    if fail_on_fault and "suspect" in verdicts:
+        raise typer.Exit(EXIT_SUSPECT)
     failures.exit_if_any()
 
 

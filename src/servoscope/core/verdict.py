@@ -8,7 +8,7 @@ counts.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ from servoscope.core.messages import Message
 
 VerdictKind = Literal["healthy", "suspect", "fault", "undetermined"]
 
+FOUND: tuple[VerdictKind, ...] = ("suspect", "fault")
 FALSE_ALARMS = 0.01  # share of healthy recordings that may be called suspect
 NORMAL_95 = 1.959963984540054  # of the normal distribution, 97.5 % below it
 SURE_LIMITS = 3.0  # limits from which one recording alone is a fault
@@ -103,27 +104,21 @@ def evidence_limit(left_out: Sequence[float], false_alarms: float = FALSE_ALARMS
     return max(least, max(left_out) - float(np.log(false_alarms * (len(left_out) + 1.0))))
 
 
-def joint_evidence(judges: Sequence[JudgeEvidence]) -> JudgeEvidence | None:
-    """Return the strongest evidence, less what it costs that the strongest of several judges is taken; None: no judge.
+def joint_evidence(told: Iterable[JudgeEvidence], judges: int) -> JudgeEvidence:
+    """Return the strongest evidence, less what it costs that it may come from each of several judges.
 
     Each has its share of the false alarms (Bonferroni): at most so many times as often is one of them above a limit.
     """
-    if not judges:
-        return None
-    strongest = max(judges, key=lambda evidence: evidence.nats)
-    return strongest._replace(nats=strongest.nats - float(np.log(len(judges))))
+    strongest = max(told, key=lambda evidence: evidence.nats, default=JudgeEvidence("", 0.0))
+    return strongest._replace(nats=strongest.nats - float(np.log(judges)))
 
 
-def decide(
-    evidence: JudgeEvidence | None, limit: float, recordings: int = 0, before: VerdictKind = "undetermined"
-) -> Verdict:
+def decide(evidence: JudgeEvidence, limit: float, recordings: int = 0, before: VerdictKind = "undetermined") -> Verdict:
     """Return the verdict on a recording: suspect above the limit, and fault if that is sure.
 
     It is sure with a change inside the recording, at `SURE_LIMITS` times the limit, and after another recording that
     was above the limit (`before`: the verdict on the recording before).
     """
-    if evidence is None:
-        return Verdict("undetermined", 0.0, limit, recordings)
     kind: VerdictKind = "healthy"
     if evidence.nats > limit:
         sure = evidence.inside or evidence.nats > SURE_LIMITS * limit or before in ("suspect", "fault")

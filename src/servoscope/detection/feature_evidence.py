@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from servoscope.baseline.feature_model import FeatureModel, FeatureName, GroupStatistic
-from servoscope.baseline.feature_spans import SpanFeatures
 from servoscope.core import outofcore
 from servoscope.core.arrays import FloatArray, IntArray
 from servoscope.core.messages import Message, message
@@ -64,29 +62,15 @@ class FeatureEvidence:
         above = np.flatnonzero(self.values > 1.0)
         return self.spans[int(above[0])] if above.size else None
 
-    @cached_property
-    def p_value(self) -> float | None:
-        """How often chance makes a healthy recording as unlike the others, whatever their distribution; None: no span.
-
-        See `FeatureModel.conformal_p_value`.
-        """
-        return self.model.conformal_p_value(mean_of([span.features for span in self.spans])) if self.spans else None
-
     def headline(self, span: SpanScore, point: str = "") -> Message:
         """Return the verdict in one sentence, of a recording whose coefficients are healthy."""
         at = message("diagnosis.point", name=point) if point else None
         return message("diagnosis.changed", point=at, change=self._changes(span)[0])
 
     def reasons(self, span: SpanScore, alone: bool) -> tuple[Message, ...]:
-        """Say what differs in a span, how sure that is, and, if no coefficient has changed, what usually does that."""
-        chance = message(
-            "diagnosis.features_chance",
-            recordings=self.model.recordings,
-            guaranteed=self.p_value,
-            model=self.model.false_alarms,
-        )
+        """Say what differs in a span and, if no coefficient has changed, what usually does that."""
         hints = self._hints(span) if alone else ()
-        return message("diagnosis.features", changes=self._changes(span)), *hints, chance
+        return message("diagnosis.features", changes=self._changes(span)), *hints
 
     def _hints(self, span: SpanScore) -> tuple[Message, ...]:
         """Say what usually does that: by the signals whose bands have grown, or by means that have moved alone."""
@@ -119,28 +103,6 @@ class FeatureEvidence:
             values, healthy = later, later - values + healthy
         names = [FeatureName.of(self.model.layout, feature) for feature in statistic.group.kept]
         return list(zip(names, values.tolist(), healthy.tolist(), off.tolist(), strict=True))
-
-
-def mean_of(spans: Sequence[SpanFeatures]) -> SpanFeatures:
-    """Return the mean of spans, each weighted by its windows."""
-    counts = np.array([span.counts for span in spans])
-    shifts = np.array([span.shift_counts for span in spans])
-    return SpanFeatures(
-        _weighted_mean([span.values for span in spans], counts),
-        counts.sum(axis=0),
-        spans[-1].motion,
-        _weighted_mean([span.shift for span in spans], shifts),
-        shifts.sum(axis=0),
-        np.mean([span.covariates for span in spans], axis=0),
-    )
-
-
-def _weighted_mean(arrays: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
-    values = np.array(arrays)
-    seen = np.isfinite(values)
-    weight = np.where(seen, weights[:, :, None], 0.0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray((weight * np.where(seen, values, 0.0)).sum(axis=0) / weight.sum(axis=0))
 
 
 def _describe(name: FeatureName, value: float, healthy: float) -> Message:

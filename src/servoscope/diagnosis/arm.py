@@ -14,9 +14,10 @@ from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import RecordingError
 from servoscope.core.messages import Message, message
+from servoscope.core.verdict import VerdictKind
 from servoscope.detection.arm_events import ArmEvent, find_events, outside_events, outside_torque, target_jumps
 from servoscope.detection.arm_evidence import INTERVAL, MIN_END_BLOCKS, CauseEvidence, ChangeEvidence, ChangeTest
-from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, FaultInterval, FinalCoefficient, Verdict
+from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, FaultInterval, FinalCoefficient
 from servoscope.estimation.arm_regression import (
     MIN_MOVING_S,
     ArmSignals,
@@ -158,7 +159,7 @@ def _change_test(baseline: ArmBaseline, information: Information, causes: Sequen
 
 def _result(
     recording: ArmRecording,
-    verdict: Verdict,
+    verdict: VerdictKind,
     headline: Message,
     warnings: Sequence[DiagnosisWarning],
     parameters: dict[str, FinalCoefficient] | None = None,
@@ -228,7 +229,7 @@ def _smallest_changes(baseline: ArmBaseline, information: Information, moved: Bo
 
 def _explain(
     baseline: ArmBaseline, evidence: ChangeEvidence, rows: Rows
-) -> tuple[Verdict, Message, FaultInterval, tuple[Message, ...]]:
+) -> tuple[VerdictKind, Message, FaultInterval, tuple[Message, ...]]:
     """Return verdict, headline, interval and reasons of a change."""
     named = [index for index, cause in enumerate(evidence.causes) if cause.cause.kind != UNKNOWN]
     explained = evidence.causes[named[0]].log_factor / max(evidence.log_factor, 1e-9)

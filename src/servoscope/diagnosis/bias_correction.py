@@ -13,10 +13,10 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
 from servoscope.detection.onset import Onset
 from servoscope.detection.trace import Trace
-from servoscope.diagnosis.result import VIBRATION
+from servoscope.diagnosis.result import VIBRATION, FinalCoefficient, ResponsePoint
 from servoscope.estimation import frequency_response
 from servoscope.estimation.filter_bank import nominal_theta
-from servoscope.estimation.frequency_response import FrequencyResponse
+from servoscope.estimation.frequency_response import FrequencyResponse, response_rows
 from servoscope.evidence.examination import Examination
 from servoscope.fit.search import Experiment, fit
 from servoscope.isolation.candidate import UNKNOWN, Candidate
@@ -198,3 +198,24 @@ def fit_actuator(
     white = np.linalg.solve(L, J / size[:, None])
     fitted = np.linalg.solve(white.T @ white + np.eye(len(names)) / PRIOR_LOG_STD**2, white.T @ np.linalg.inv(L) / size)
     return faulty(x), np.eye(len(theta)) + (T - J) @ fitted
+
+
+def final_coefficients(trace: Trace) -> dict[str, FinalCoefficient]:
+    """Return the coefficients at the end of a trace."""
+    if not len(trace.t):
+        return {}
+    std = np.sqrt(np.diag(trace.covariance[-1]))
+    return {
+        name: FinalCoefficient(value=float(value), std=float(s), nominal=float(nominal))
+        for name, value, s, nominal in zip(trace.names, trace.theta[-1], std, trace.expected[-1], strict=True)
+    }
+
+
+def final_response(trace: Trace) -> tuple[ResponsePoint, ...]:
+    """Return the iFRF at the end of a trace."""
+    if not len(trace.t):
+        return ()
+    rows = response_rows(trace.ifrf, trace.ifrf_expected, -1)
+    columns = np.column_stack([rows[:, :3], np.sqrt(rows[:, [5, 7]]), rows[:, 3:5]])
+    names = ResponsePoint.model_fields
+    return tuple(ResponsePoint(**dict(zip(names, row, strict=True))) for row in columns.tolist())

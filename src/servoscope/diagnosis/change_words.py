@@ -5,11 +5,35 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from servoscope.core.messages import Message, catalogue, message
-from servoscope.isolation.candidate import FaultEstimate
+from servoscope.core.verdict import Verdict
+from servoscope.diagnosis.result import FaultInterval
+from servoscope.isolation.candidate import UNKNOWN, FaultEstimate
 
 FRACTIONS = {0.1: "tenth", 0.2: "fifth", 0.25: "quarter", 1.0 / 3.0: "third", 0.5: "half"}
 MAX_FRACTION_ERROR = 0.05  # of a change that is called by a fraction, relative to the fraction
 MIN_FACTOR = 2.5  # ratio from which a change is a multiple of the healthy value, not a percentage more than it
+
+
+MIN_LIKELY_PROBABILITY = 0.5  # of an explanation of a suspect recording that is worth telling
+MAX_ONE_IN = 1e6  # recordings: no model is believed further
+
+
+def suspect_headline(interval: FaultInterval, said: Message, point: str) -> Message:
+    """Return what to do with a recording that is unlike healthy ones, but not yet a fault, and its likeliest cause."""
+    at = message("diagnosis.point", name=point) if point else None
+    if (change := said.values.get("change")) is not None:
+        return message("diagnosis.suspect", point=at, likely=message("diagnosis.suspect_change", change=change))
+    best = interval.candidates[0]
+    known = best.name != UNKNOWN and best.probability >= MIN_LIKELY_PROBABILITY
+    names = tuple(map(fault_label, best.names))
+    likely = message("diagnosis.suspect_likely", names=names, probability=best.probability) if known else None
+    return message("diagnosis.suspect", point=at, likely=likely)
+
+
+def how_sure(verdict: Verdict) -> Message:
+    """Return how many healthy recordings would look like this: by the number of those left out, and by the model."""
+    one_in = min(1.0 / verdict.by_model, MAX_ONE_IN) if verdict.by_model else MAX_ONE_IN
+    return message("diagnosis.how_sure", guaranteed=verdict.recordings + 1, model=float(f"{one_in:.1g}"))
 
 
 def change_messages(faults: Sequence[FaultEstimate]) -> tuple[Message, ...]:

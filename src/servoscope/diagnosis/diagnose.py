@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any, overload
 
 import numpy as np
 
@@ -13,24 +14,30 @@ from servoscope.core import outofcore
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import RecordingError, SimulationError
 from servoscope.core.messages import Message, message
+from servoscope.core.verdict import FOUND, VerdictKind
 from servoscope.detection.louder_noise import find_louder_noise
 from servoscope.detection.onset import Onset
 from servoscope.detection.trace import UNSEEN_EXCESS, Trace
 from servoscope.diagnosis import ml_refit
+from servoscope.diagnosis.account import Account
 from servoscope.diagnosis.batch_estimate import isolation_inputs
-from servoscope.diagnosis.bias_correction import BiasCorrection, corrected_trace, estimate_bias_correction
+from servoscope.diagnosis.bias_correction import (
+    BiasCorrection,
+    corrected_trace,
+    estimate_bias_correction,
+    final_coefficients,
+    final_response,
+)
+from servoscope.diagnosis.change_words import how_sure, suspect_headline
 from servoscope.diagnosis.checks import what_to_check
 from servoscope.diagnosis.explanation import build_headline, build_reasons, unwatched_changes
 from servoscope.diagnosis.own_past import examine_by_own_past, own_past_warning
-from servoscope.diagnosis.recording_alarm import RecordingAlarm, first_alarm
+from servoscope.diagnosis.recording_alarm import RecordingAlarm, covers, first_alarm, onset_of
 from servoscope.diagnosis.repair import is_repaired, repaired_interval
 from servoscope.diagnosis.result import (
     Diagnosis,
     DiagnosisWarning,
     FaultInterval,
-    FinalCoefficient,
-    ResponsePoint,
-    Verdict,
     keep_inputs,
     recording_facts,
 )
@@ -48,7 +55,6 @@ from servoscope.diagnosis.warnings import (
     power_warnings,
     warning_throughout,
 )
-from servoscope.estimation.frequency_response import response_rows
 from servoscope.evidence.examination import Examination
 from servoscope.evidence.kinds import findings
 from servoscope.evidence.sensors import check_sensors
@@ -61,19 +67,44 @@ from servoscope.signals import MIN_SAMPLES, Recording
 from servoscope.signals.readers import as_recording
 from servoscope.signals.readers.frames import Source
 
+Progress = Callable[[str], None]
+
 MIN_CERTAINTY = 0.95  # probability from which a fault is named
 MAX_SIGNAL = 1e60  # of a signal; products of four of them still are numbers
 MIN_UNKNOWN_PROBABILITY = 0.05  # of an unknown change, from which an operating point does not explain a recording
 
 
-@with_one_blas_thread
+@overload
 def diagnose(
     baseline: Baseline | str | Path,
     recording: Recording | Source,
+    progress: Callable[[str], None] = ...,
+    *,
+    point: str | None = None,
+    before: VerdictKind = ...,
+) -> Diagnosis: ...
+
+
+@overload
+def diagnose(
+    baseline: Baseline | str | Path,
+    recording: list[Recording | Source] | list[Recording] | list[Path] | list[str],
+    progress: Callable[[str], None] = ...,
+    *,
+    point: str | None = None,
+    before: VerdictKind = ...,
+) -> tuple[Diagnosis, ...]: ...
+
+
+@with_one_blas_thread
+def diagnose(
+    baseline: Baseline | str | Path,
+    recording: Any,
     progress: Callable[[str], None] = lambda _: None,
     *,
     point: str | None = None,
-) -> Diagnosis:
+    before: VerdictKind = "undetermined",
+) -> Any:
     """Say whether the actuator was healthy; if not, what changed, by how much, since when, and how sure that is.
 
     Parameters
@@ -81,7 +112,8 @@ def diagnose(
     baseline
         What healthy looks like, or its path.
     recording
-        The recording to judge, or what `read` reads: a path, a frame, arrays by name.
+        The recording to judge, or what `read` reads: a path, a frame, arrays by name. A list of them in order of time:
+        one that is suspect after another one is a fault, and all diagnoses are returned.
     progress
         Called with the name of each step.
     point
@@ -89,6 +121,8 @@ def diagnose(
         A change is explained at the point where the recording stays healthy for longest; among points within one
         memory of that, where a known fault explains it, and then where it is smallest. A warning names other points
         that explain it too.
+    before
+        The verdict on the recording before this one, where it is known.
 
     Raises
     ------
@@ -103,9 +137,18 @@ def diagnose(
     'healthy'
     >>> [(fault.name, round(fault.ratio, 2)) for fault in diagnose("baseline.json", "friday.csv").faults]
     [('lubrication', 1.25)]
+    >>> [told.verdict for told in diagnose("baseline.json", ["wednesday.csv", "friday.csv"])]
+    ['healthy', 'fault']
     """
     learned = Baseline.of(baseline)
-    diagnosis = _diagnose_at_point(learned, as_recording(recording, learned.loop), progress, point)[0]
+    if isinstance(recording, list):
+        told = list[Diagnosis]()
+        for one in recording:
+            told.append(diagnose(baseline, one, progress, point=point, before=before))
+            before = told[-1].verdict
+        return tuple(told)
+    judged = as_recording(recording, learned.loop)
+    diagnosis = _diagnose_at_point(learned, judged, progress, point, before)[0]
     return keep_inputs(diagnosis, baseline if point is None else learned.at(point), recording)
 
 
@@ -116,42 +159,43 @@ def diagnose_with_trace(
     progress: Callable[[str], None] = lambda _: None,
     *,
     point: str | None = None,
+    before: VerdictKind = "undetermined",
 ) -> tuple[Diagnosis, Trace]:
     """Return the diagnosis of a recording together with its trace; arguments and errors as for `diagnose`."""
     learned = Baseline.of(baseline)
     judged = as_recording(recording, learned.loop)
-    diagnosis, exam, correction = _diagnose_at_point(learned, judged, progress, point)
+    diagnosis, exam, correction = _diagnose_at_point(learned, judged, progress, point, before)
     return diagnosis, corrected_trace(exam, correction)
 
 
 def _diagnose_at_point(
-    baseline: Baseline, recording: Recording, progress: Callable[[str], None], point: str | None
+    baseline: Baseline, recording: Recording, progress: Progress, point: str | None, before: VerdictKind
 ) -> tuple[Diagnosis, Examination, BiasCorrection | None]:
     """Return the diagnosis at the operating point that explains the recording, and what its trace is made of."""
     largest = max(abs(bound) for x in (recording.r, recording.u, recording.y) for bound in outofcore.extremes(x))
     if largest > MAX_SIGNAL:
         raise RecordingError(f"{recording.name}: has values up to {largest:.2g}, check the units of r, u and y")
     try:
-        return _judge_sound_part(baseline, recording, progress, point)
+        return _judge_sound_part(baseline, recording, progress, point, before)
     except (np.linalg.LinAlgError, SimulationError, ArithmeticError) as error:
         reason = f"its numbers have no solution ({error})"
         raise RecordingError(f"{recording.name}: {reason}; check units, signs and sizes of r, u and y") from None
 
 
 def _judge_sound_part(
-    baseline: Baseline, recording: Recording, progress: Callable[[str], None], point: str | None
+    baseline: Baseline, recording: Recording, progress: Progress, point: str | None, before: VerdictKind
 ) -> tuple[Diagnosis, Examination, BiasCorrection | None]:
     """Return what `_diagnose_at_point` does, of the recording up to a signal that is stuck or jumps."""
     defect = find_signal_defect(recording, baseline.loop.delay)
     if defect is not None:
         sound = recording.part(float(recording.t[0]), float(recording.t[max(defect.begin, MIN_SAMPLES)]))
-        diagnosis, exam, correction = _judge_signals(baseline, sound, progress, point)
+        diagnosis, exam, correction = _judge_signals(baseline, sound, progress, point, before)
         return limit_to_sound_part(diagnosis, recording, defect), exam, correction
-    return _judge_signals(baseline, recording, progress, point)
+    return _judge_signals(baseline, recording, progress, point, before)
 
 
 def _judge_signals(
-    baseline: Baseline, recording: Recording, progress: Callable[[str], None], point: str | None
+    baseline: Baseline, recording: Recording, progress: Progress, point: str | None, before: VerdictKind
 ) -> tuple[Diagnosis, Examination, BiasCorrection | None]:
     points = baseline.per_point if point is None else (baseline.at(point),)
     recording, departed = check_sensors(points[0], recording)
@@ -159,11 +203,12 @@ def _judge_signals(
     model = points[0].covariates
     if model is not None and (missing := model.describe_missing(recording.channels)) is not None:
         raise RecordingError(f"{recording.name}: {missing}")
+    points = tuple(Account(at_point).shared(recording.duration_s) for at_point in points)
     exams = [Examination.from_recording(at_point, recording) for at_point in points]
     if (unusable := next(findings(exams[0], "undetermined"), None)) is not None:
         return leave_undetermined(exams[0], unusable.text), exams[0], None
     if (own := next(filter(None, map(examine_by_own_past, exams)), None)) is not None and own.alarm.any():
-        diagnosis, correction = diagnose_examination(own, progress)
+        diagnosis, correction = diagnose_examination(own, progress, inside=True)
         return _with_warnings(diagnosis, [own_past_warning(own), *sensors]), own, correction
     last = max(_first_alarm_time(exam) for exam in exams)
     near = last - baseline.loop.monitor.memory if np.isfinite(last) else last
@@ -176,10 +221,10 @@ def _judge_signals(
         return leave_undetermined(rivals[0], reason), rivals[0], None
     noise = find_louder_noise(recording, baseline.loop.monitor.memory) if baseline.axis is None else None
     if noise is not None:
-        return judge_both_sides(recording, noise, lambda side: _judge_signals(baseline, side, progress, point))
+        return judge_both_sides(recording, noise, lambda side: _judge_signals(baseline, side, progress, point, before))
     diagnoses = sorted(
-        ((*diagnose_examination(exam, progress), exam) for exam in rivals),
-        key=lambda judged: (judged[0].verdict != "fault", _change_size(judged[0])),
+        ((*diagnose_examination(exam, progress, before), exam) for exam in rivals),
+        key=lambda judged: (judged[0].verdict not in FOUND, _change_size(judged[0])),
     )
     diagnosis, correction, exam = diagnoses[0]
     others = [message("warning.point", other=other.headline) for other, *_ in diagnoses[1:] if _is_explained(other)]
@@ -192,6 +237,8 @@ def _with_warnings(diagnosis: Diagnosis, warnings: Sequence[DiagnosisWarning]) -
 
 
 def _first_alarm_time(exam: Examination) -> float:
+    if Account(exam.baseline).verdict(exam).kind not in FOUND:
+        return np.inf
     alarm, changed = exam.apparent_alarm, exam.features_changed_s
     first = float(exam.t(int(alarm.argmax()))) if alarm.any() else np.inf
     return min(first, np.inf if changed is None else changed)
@@ -215,35 +262,49 @@ def _is_explained(diagnosis: Diagnosis) -> bool:
 
 
 def diagnose_examination(
-    exam: Examination, progress: Callable[[str], None] = lambda _: None
+    exam: Examination,
+    progress: Progress = lambda _: None,
+    before: VerdictKind = "undetermined",
+    *,
+    inside: bool = False,
 ) -> tuple[Diagnosis, BiasCorrection | None]:
-    """Return the diagnosis of an examination, and how its estimates become those of the actuator itself."""
+    """Return the diagnosis of an examination, and how its estimates become those of the actuator itself.
+
+    `before`: the verdict on the recording before; `inside`: whether it is known that a change came within this one.
+    """
     recording, baseline, last = exam.recording, exam.baseline, exam.evaluations - 1
-    alarm, at, features = first_alarm(exam, progress), last, exam.features
-    verdict: Verdict = "fault"
+    told = Account(baseline).verdict(exam, before, inside=inside)
+    verdict, found, at, features = told.kind, told.kind in FOUND, last, exam.features
+    alarm = first_alarm(exam, progress) if found else None
     intervals: tuple[FaultInterval, ...] = ()
     onset: Onset | None = None
     if alarm is not None:
         at = alarm.evaluation
         intervals, onset, doubts = _explain_alarm(exam, alarm, progress)
+        if baseline.thresholds.hypotheses and not intervals[-1].from_start:  # healthy recordings do not scatter
+            verdict = "fault"
         verdict = "healthy" if is_repaired(exam, intervals) else verdict
         warnings = _all_warnings(exam, doubts)
         headline = build_headline(verdict, intervals, {}, warnings, baseline.point)
-    elif (change := next(findings(exam, "change"), None)) is not None:
+    elif found and (change := next(findings(exam, "change"), None)) is not None:
         unknown = (Candidate(name=UNKNOWN, probability=1.0),)
         intervals = (FaultInterval(detected_at_s=change.from_s, probability=1.0, candidates=unknown),)
         headline, warnings = change.text, _all_warnings(exam, [])
     else:
         verdict, headline, warnings = judge_without_alarm(exam)
+    if verdict == "suspect":
+        headline = suspect_headline(intervals[-1], headline, baseline.point)
     interval = next(
-        (known for known in intervals if _covers(known, float(exam.t(at)))), intervals[-1] if intervals else None
+        (known for known in intervals if covers(known, float(exam.t(at)))), intervals[-1] if intervals else None
     )
     correction = estimate_bias_correction(exam, interval.candidates if interval else (), onset, at)
     end = corrected_trace(exam, correction, slice(max(last, 0), last + 1))
     explained = end if at == last else corrected_trace(exam, correction, slice(at, at + 1))
     reasons = build_reasons(exam, explained, interval) if alarm is not None and interval is not None else ()
-    if features is not None and (changed := features.changed) is not None:
+    if found and features is not None and (changed := features.changed) is not None:
         reasons = (*reasons, *features.reasons(changed, alone=alarm is None))
+    if verdict in FOUND and told.recordings:
+        reasons = (*reasons, how_sure(told))
     diagnosis = Diagnosis(
         **recording_facts(recording),
         verdict=verdict,
@@ -251,19 +312,20 @@ def diagnose_examination(
         reasons=reasons,
         checks=what_to_check(baseline.loop, interval),
         intervals=intervals,
-        parameters=_final_coefficients(end),
-        ifrf=_final_response(end),
+        parameters=final_coefficients(end),
+        ifrf=final_response(end),
         warnings=tuple(sorted(warnings, key=lambda warning: warning.from_s)),
         point=baseline.point or None,
     )
     return diagnosis, correction
 
 
-def judge_without_alarm(exam: Examination) -> tuple[Verdict, Message, list[DiagnosisWarning]]:
+def judge_without_alarm(exam: Examination) -> tuple[VerdictKind, Message, list[DiagnosisWarning]]:
     """Return the verdict, the headline and the warnings of an examination that has found no change."""
     detectable = detectable_sizes(exam)
     doubts = power_warnings(exam, detectable)
-    verdict: Verdict = "undetermined" if doubts or exam.apparent_alarm.any() else "healthy"
+    withheld = exam.apparent_alarm.any() and Account(exam.baseline).verdict(exam).kind in FOUND
+    verdict: VerdictKind = "undetermined" if doubts or withheld else "healthy"
     warnings, unwatched = _all_warnings(exam, doubts), unwatched_changes(exam.baseline.plant, detectable)
     return verdict, build_headline(verdict, (), detectable, warnings, exam.baseline.point, unwatched), warnings
 
@@ -302,7 +364,7 @@ def _explain_alarm(
         trace = partial(trace_timeline, exam, refined, alarm.onset, recursive, MIN_CERTAINTY)
         several = () if outside else trace(lambda: progress("refit"))
         if several:
-            return several, _onset_of(several, exam, alarm), []
+            return several, onset_of(several, exam, alarm), []
         candidates = ml_refit.refit_candidates(refined)
         refit = ml_refit.summarise_refit(refined, exam, recursive, outside=outside)
         if outside or not refined.is_unknown:
@@ -328,39 +390,7 @@ def _explain_alarm(
     return (interval,), onset, doubts
 
 
-def _covers(interval: FaultInterval, t: float) -> bool:
-    begin = -np.inf if interval.onset_s is None else interval.onset_s[1]
-    return begin <= t and (interval.end_s is None or t <= interval.end_s)
-
-
-def _onset_of(intervals: Sequence[FaultInterval], exam: Examination, alarm: RecordingAlarm) -> Onset:
-    """Return the onset of the interval in which the explained evaluation lies, the last one where none does."""
-    at = float(exam.t(alarm.evaluation))
-    interval = next((known for known in intervals if _covers(known, at)), intervals[-1])
-    assert interval.onset_s is not None
-    return Onset(*interval.onset_s, int(np.searchsorted(exam.recording.t, interval.onset_s[1])))
-
-
 def _prefers_learned_fault(refined: RefitResult, recursive: Candidate) -> bool:
     """Return whether a fault learned from labelled recordings explains more than the refit, which knows none."""
     sure = recursive.is_learned and recursive.probability >= MIN_CERTAINTY
     return sure and (refined.is_unknown or len(refined.best.fitted.faults) > 1)
-
-
-def _final_coefficients(trace: Trace) -> dict[str, FinalCoefficient]:
-    if not len(trace.t):
-        return {}
-    std = np.sqrt(np.diag(trace.covariance[-1]))
-    return {
-        name: FinalCoefficient(value=float(value), std=float(s), nominal=float(nominal))
-        for name, value, s, nominal in zip(trace.names, trace.theta[-1], std, trace.expected[-1], strict=True)
-    }
-
-
-def _final_response(trace: Trace) -> tuple[ResponsePoint, ...]:
-    if not len(trace.t):
-        return ()
-    rows = response_rows(trace.ifrf, trace.ifrf_expected, -1)
-    columns = np.column_stack([rows[:, :3], np.sqrt(rows[:, [5, 7]]), rows[:, 3:5]])
-    names = ResponsePoint.model_fields
-    return tuple(ResponsePoint(**dict(zip(names, row, strict=True))) for row in columns.tolist())

@@ -10,10 +10,11 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import LoopError
 from servoscope.core.messages import Message, message
 from servoscope.core.number_format import ratio_digits
+from servoscope.core.verdict import VerdictKind
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.change_words import change_messages, fault_label
 from servoscope.diagnosis.ml_refit import is_equal_pair
-from servoscope.diagnosis.result import VIBRATION, DiagnosisWarning, FaultInterval, RefitSummary, Verdict
+from servoscope.diagnosis.result import VIBRATION, DiagnosisWarning, FaultInterval, RefitSummary
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.evidence.examination import Examination
 from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
@@ -32,7 +33,7 @@ def undetermined_headline(reason: Message, point: str = "") -> Message:
 
 
 def build_headline(
-    verdict: Verdict,
+    verdict: VerdictKind,
     intervals: Sequence[FaultInterval],
     detectable: Mapping[str, tuple[float, float]],
     warnings: Sequence[DiagnosisWarning],

@@ -13,6 +13,7 @@ from typing import Literal
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import BaselineError, NotEnoughError
 from servoscope.core.messages import Message, message
+from servoscope.core.verdict import FOUND
 from servoscope.diagnosis import learn_faults
 from servoscope.diagnosis.diagnose import diagnose
 from servoscope.diagnosis.learn_faults import LabelledRecordings
@@ -225,13 +226,13 @@ def compare_with_earlier(
     notes = []
     for rec in recordings:
         diagnosis = diagnose(earlier, rec, point=point if point in earlier.points else None)
-        if diagnosis.verdict == "fault" and not accept:
+        if diagnosis.verdict in FOUND and not accept:
             raise BaselineError(
                 f"{rec.name} is not healthy by the {rank} baseline. {diagnosis.summary} Nothing was learned; find the "
                 "cause, or accept the change (--accept-change)"
             )
         known = {"recording": rec.name, "hash": earlier.hash}
-        if diagnosis.verdict == "fault":
+        if diagnosis.verdict in FOUND:
             notes.append(message("learning.accepted", **known, headline=diagnosis.headline))
         elif diagnosis.verdict == "undetermined":
             notes.append(message("learning.not_comparable", **known))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from servoscope.detection.onset import Onset, estimate_onset
 from servoscope.diagnosis.output_onset import refine_onset
 from servoscope.diagnosis.pressure_evidence import pressure_onset
+from servoscope.diagnosis.result import FaultInterval
 from servoscope.evidence.examination import Examination
 
 
@@ -48,3 +51,17 @@ def first_alarm(exam: Examination, progress: Callable[[str], None] = lambda _: N
         max(int(exam.estimates.index[at]), sample),
     )
     return RecordingAlarm(sample, at, refine_onset(exam, onset, sample, int(exam.estimates.index[at])))
+
+
+def covers(interval: FaultInterval, t: float) -> bool:
+    """Return whether an interval lasts at a time [s]."""
+    begin = -np.inf if interval.onset_s is None else interval.onset_s[1]
+    return begin <= t and (interval.end_s is None or t <= interval.end_s)
+
+
+def onset_of(intervals: Sequence[FaultInterval], exam: Examination, alarm: RecordingAlarm) -> Onset:
+    """Return the onset of the interval in which the explained evaluation lies, the last one where none does."""
+    at = float(exam.t(alarm.evaluation))
+    interval = next((known for known in intervals if covers(known, at)), intervals[-1])
+    assert interval.onset_s is not None
+    return Onset(*interval.onset_s, int(np.searchsorted(exam.recording.t, interval.onset_s[1])))

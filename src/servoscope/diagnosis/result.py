@@ -6,7 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from pydantic import computed_field, model_validator
 
@@ -23,6 +23,7 @@ from servoscope.core.messages import (
     text_message,
 )
 from servoscope.core.short_repr import ShortRepr
+from servoscope.core.verdict import VerdictKind
 from servoscope.diagnosis.dates import TIMELINES, date_timeline
 from servoscope.isolation.candidate import Candidate, FaultEstimate, ResultModel
 from servoscope.signals import Defect, Recording
@@ -31,7 +32,6 @@ from servoscope.signals.recording import frame_of
 if TYPE_CHECKING:  # a result is read without the kernels of an examination
     from servoscope.evidence.kind import Finding
 
-Verdict = Literal["healthy", "fault", "undetermined"]
 MAX_ALIKE = 3  # defects of one kind that are shown one by one
 DEFECT_KINDS = ("gap", "nan", "repeat", "spike", "order", "text", "saturation")
 VIBRATION = "vibration"  # a fault that moves no parameter: what is left of the motion is louder
@@ -195,8 +195,8 @@ class Diagnosis(ShortRepr, ResultModel):
     recording, samples, duration_s
         What was examined.
     verdict
-        ``undetermined`` when the recording excites too little or is too short to show a change of the size that the
-        baseline promises.
+        ``suspect``: unlike healthy recordings, but not surely a fault; ``undetermined``: the recording excites too
+        little or is too short to show a change of the size that the baseline promises.
     headline
         The verdict in one sentence; as text: `summary`.
     reasons
@@ -228,7 +228,7 @@ class Diagnosis(ShortRepr, ResultModel):
     recording: str
     samples: int
     duration_s: float
-    verdict: Verdict
+    verdict: VerdictKind
     headline: MessageField
     reasons: tuple[MessageField, ...] = ()
     checks: tuple[MessageText, ...] = ()

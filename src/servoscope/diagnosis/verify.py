@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import RecordingError
 from servoscope.core.messages import Message, message
+from servoscope.core.verdict import VerdictKind
 from servoscope.diagnosis.diagnose import diagnose
 from servoscope.diagnosis.result import Diagnosis, Provenance
 from servoscope.signals import Recording
@@ -77,7 +78,8 @@ def verify(told: Diagnosis, baseline: Baseline, recording: Recording) -> Verific
         What it is said to be made from.
     """
     point = told.point if told.point is not None and told.point in baseline.points else None
-    again = diagnose(baseline, recording, point=point)
+    before: VerdictKind = "suspect" if told.verdict == "fault" else "undetermined"  # a fault may rest on two in a row
+    again = diagnose(baseline, recording, point=point, before=before)
     now, then = provenance(baseline, recording), told.provenance
     differences, remarks = list[Message](), list[Message]()
     if then is None:

@@ -18,6 +18,7 @@ import numpy as np
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.errors import ServoscopeError
+from servoscope.core.verdict import VerdictKind
 from servoscope.detection.covariate_monitor import fill_channels
 from servoscope.detection.statistic import consecutive_exceedances
 from servoscope.detection.trace import Trace
@@ -187,7 +188,8 @@ class DayMonitor:
         rows = replace(rows, channels=fill_channels(rows.channels, (rows.t_us - now) / MICRO, known))
         try:
             recording = rows.to_recording(state.first_us, self.baseline.loop, "window")
-            diagnosis, trace = diagnose_with_trace(baseline, recording)
+            before: VerdictKind = "undetermined" if state.alarm_us is None else "suspect"  # an alarm has lasted
+            diagnosis, trace = diagnose_with_trace(baseline, recording, before=before)
         except ServoscopeError as error:
             return {"error": str(error).removeprefix("window: ")}
         evidence = json.dumps(asdict(trace_evidence(self.baseline, trace)))

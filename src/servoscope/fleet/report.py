@@ -21,6 +21,7 @@ MIN_EPOCH_S = 1e9  # s since 1970 from which a time is a date, not a time since 
 TONES = {
     "healthy": "var(--measured)",
     "fault": "var(--alarm)",
+    "suspect": "var(--care)",
     COMMON: "var(--ink)",
     "undetermined": "var(--reference)",
     FAILED: "none",
@@ -39,7 +40,7 @@ def write_fleet_report(output: Path, fleet: Fleet, lake: str) -> None:
 
 def render_fleet_page(fleet: Fleet, lake: str) -> str:
     """Return report.html; it needs nothing from outside."""
-    states = ("healthy", "fault", COMMON, "undetermined", FAILED)
+    states = ("healthy", "fault", "suspect", COMMON, "undetermined", FAILED)
     late = sorted(fleet.late.items(), key=lambda pair: -pair[1])
     return render_page(
         "fleet.html",

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from servoscope.core.verdict import FOUND
 from servoscope.fleet.common_cause import (
     ACCEPTANCE_PROBABILITY,
     PRIOR,
@@ -108,13 +109,15 @@ def summarise_fleet(
         by_asset.setdefault(entry["asset"], {})[entry["day"]] = entry
     causes_by_day = {day: _common_causes(some.values(), groups, prior) for day, some in sorted(by_day.items())}
     states = {
-        asset: {day: _asset_state(entry, _accepted_cause(causes_by_day[day], asset)) for day, entry in days.items()}
+        asset: _in_a_row(
+            {day: _asset_state(entry, _accepted_cause(causes_by_day[day], asset)) for day, entry in days.items()}
+        )
         for asset, days in by_asset.items()
     }
     last = [days[_last_known_day(states[asset])] for asset, days in by_asset.items()]
     now = _common_causes(last, groups, prior)
     assets = [_summarise_asset(entry, groups, now, states[entry["asset"]], prior) for entry in last]
-    rank = ["fault", COMMON, "undetermined", FAILED, "healthy"]
+    rank = ["fault", COMMON, "suspect", "undetermined", FAILED, "healthy"]
     assets.sort(key=lambda asset: (rank.index(asset.state), -asset.probability, asset.asset))
     failed = [(e["asset"], e["day"], str(e["error"])) for e in entries if e["status"] == FAILED]
     since = tuple(_first_accepted_day(cause, causes_by_day) for cause in now)
@@ -172,6 +175,16 @@ def _asset_state(entry: Entry, cause: tuple[Cause, float] | None) -> str:
         return FAILED
     verdict = str(entry["diagnosis"]["verdict"])
     return COMMON if verdict == "fault" and cause is not None and cause[1] < ACCEPTANCE_PROBABILITY else verdict
+
+
+def _in_a_row(states: Mapping[str, str]) -> dict[str, str]:
+    """Return the states of days with a fault where one that was suspect came after another one."""
+    told, before = dict(states), ""
+    for day in sorted(states):
+        if states[day] == "suspect" and before in FOUND:
+            told[day] = "fault"
+        before = states[day]
+    return told
 
 
 def _summarise_asset(

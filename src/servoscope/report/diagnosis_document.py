@@ -48,7 +48,7 @@ MIN_PROBABILITY_SHOWN = 0.01  # probability below which a candidate has no line
 MIN_PROBABILITY_LIKELY = 0.05  # probability from which a candidate counts in sentences
 MAX_WARNINGS = 60
 HEALTHY_KEYS = "diagnosis.healthy", "diagnosis.healthy_limits"
-LABELS = {"fault": "Fault", "healthy": "Healthy", "undetermined": "Undetermined"}
+LABELS = {"fault": "Fault", "suspect": "Suspect", "healthy": "Healthy", "undetermined": "Undetermined"}
 
 
 class DiagnosisContext(NamedTuple):

@@ -31,6 +31,7 @@ COLOURS = {
     "healthy": "green",
     "usable": "green",
     "fault": "red",
+    "suspect": "yellow",
     "not usable": "red",
     "stop": "red",
     "undetermined": "yellow",

@@ -36,6 +36,7 @@ class AxisChange:
     onset: int  # the most likely one
     detected: int  # when what had been measured by then was enough to tell it
     vibration: AxisVibration | None = None  # where not a coefficient changed; its onsets are samples of the recording
+    excess: float = 1.0  # of the likelihood ratio over its limit
     repaired: bool = False  # whether the axis was not what the baseline calls healthy before, and is so since
 
     @property
@@ -74,7 +75,8 @@ def _named_change(window: AxisWindow, change: _ChangeFit, limit: float, enough: 
     low, at, high = (window.first_sample + window.stride * k for k in ends)
     within = vibration and replace(vibration, onset=(low, at, high))
     repaired = vibration is None and _is_repaired(window, onset)
-    return AxisChange(at, window.first_sample + window.stride * told, within, repaired)
+    excess = change.gain / limit if vibration is None else vibration.statistic / enough
+    return AxisChange(at, window.first_sample + window.stride * told, within, excess, repaired)
 
 
 def _is_repaired(window: AxisWindow, onset: int) -> bool:

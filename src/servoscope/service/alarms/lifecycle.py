@@ -40,7 +40,11 @@ NE107_OF_QUALITY: dict[str, Ne107] = {  # of a signal that does not come yet, th
     **dict.fromkeys(("silent", "frozen_y", "frozen_u"), "failure"),
     **dict.fromkeys(("gap", "jitter", "rate", "clock"), "out_of_specification"),
 }
-NE107_OF_VERDICT: dict[str, Ne107] = {"undetermined": "function_check", "fault": "maintenance_required"}
+NE107_OF_VERDICT: dict[str, Ne107] = {
+    "undetermined": "function_check",
+    "suspect": "maintenance_required",
+    "fault": "maintenance_required",
+}
 
 
 def initial_alarm_state(asset: str, alarm: str, time: float) -> AlarmState:

@@ -15,10 +15,11 @@ from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.covariates import hold_last
 from servoscope.core.errors import RecordingError, ServoscopeError
 from servoscope.core.messages import Message, message, render
+from servoscope.core.verdict import VerdictKind
 from servoscope.detection.covariate_monitor import CovariateHistory, fill_channels
 from servoscope.detection.warm_up import COURSE_CHANNELS
 from servoscope.diagnosis.dates import TIMELINES
-from servoscope.diagnosis.result import Diagnosis, Verdict
+from servoscope.diagnosis.result import Diagnosis
 from servoscope.isolation.candidate import FaultEstimate
 from servoscope.service.sources.block import Block
 from servoscope.signals import Recording, clean
@@ -35,7 +36,7 @@ class StoredDiagnosis(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    verdict: Verdict  # at the end of the window
+    verdict: VerdictKind  # at the end of the window
     headline: Message
     onset: float | None = None  # of the fault [UTC s]
     document: dict[str, Any] = {}  # of a diagnosis: as `diagnose --json` prints it
@@ -89,7 +90,7 @@ def examine_blocks(
     blocks: Sequence[Block],
     features: float | None = None,
     fault: str | None = None,
-    known: Verdict | None = None,
+    known: VerdictKind | None = None,
     assess: bool = False,
 ) -> StoredDiagnosis:
     """Examine the last minutes with the reference that was applied in them, without a refit.
@@ -211,7 +212,7 @@ def _diagnose_loop(baseline: Baseline, name: str, blocks: Sequence[Block]) -> tu
     from servoscope.diagnosis.verify import provenance
 
     recording, start = blocks_to_recording(baseline, name, blocks)
-    diagnosis = diagnose(baseline, recording)
+    diagnosis = diagnose(baseline, recording, before="suspect")  # the monitor has raised an alarm over minutes
     diagnosis = diagnosis.model_copy(update={"provenance": provenance(baseline, recording)})
     since = diagnosis.onset_s[1] if diagnosis.onset_s is not None else None
     return diagnosis, start, {"signature": signature_columns(recording, baseline.loop, since)}

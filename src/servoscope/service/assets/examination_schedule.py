@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from servoscope.core.messages import message, render
-from servoscope.diagnosis.result import Verdict
+from servoscope.core.verdict import VerdictKind
 from servoscope.diagnosis.schedule import DiagnosisSchedule
 from servoscope.service.assets.examination import StoredDiagnosis
 from servoscope.service.config import DiagnosisSettings
@@ -42,7 +42,7 @@ class ExaminationState:
     """What is kept between two examinations; times are [UTC s]."""
 
     due: float  # the next one
-    verdict: Verdict = "undetermined"  # of the last one
+    verdict: VerdictKind = "undetermined"  # of the last one
     summary: str = field(default_factory=lambda: render(message("service.examination.none")))
     since: float = 0.0  # since when the verdict holds
     onset: float | None = None  # since when the fault is there

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from servoscope.baseline.arm import AnyBaseline, ArmBaseline
 from servoscope.baseline.records import Occasion
 from servoscope.core.messages import message, render
-from servoscope.diagnosis.result import Verdict
+from servoscope.core.verdict import VerdictKind
 from servoscope.isolation.candidate import FaultEstimate
 from servoscope.service.alarms import (
     FAULT_ALARM,
@@ -91,7 +91,7 @@ class AssetMetadata(_StatusRecord):
 class AssetVerdict(_StatusRecord):
     """What is said of an asset."""
 
-    verdict: Verdict
+    verdict: VerdictKind
     summary: str
     since: float  # since when the verdict holds [UTC s]
     onset: float | None  # of the fault [UTC s]

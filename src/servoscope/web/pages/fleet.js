@@ -96,7 +96,7 @@ export async function show(main, { signal, linked, values }) {
   }
 
   function recount() {
-    const found = { "": assets.size, fault: 0, undetermined: 0, healthy: 0 };
+    const found = { "": assets.size, fault: 0, suspect: 0, undetermined: 0, healthy: 0 };
     for (const key of Object.keys(QUESTIONS)) found[key] = 0;
     for (const { row } of assets.values()) {
       found[row.verdict] += 1;
@@ -243,7 +243,7 @@ function dress({ row, tile }) {
   const words = `${row.asset}: ${VERDICTS[row.verdict]}${open ? ", alarm to acknowledge" : ""}`;
   if (tile.dataset.look !== look) {
     tile.dataset.look = look;
-    for (const name of ["fault", "healthy", "undetermined"]) tile.classList.toggle(name, name === row.verdict);
+    for (const name of ["fault", "suspect", "healthy", "undetermined"]) tile.classList.toggle(name, name === row.verdict);
     tile.classList.toggle("open", open);
     tile.replaceChildren(mark(row.verdict));
   }
@@ -314,7 +314,7 @@ function beginning() {
 }
 
 function withoutVerdict(words) {
-  const verdict = ["Fault", "Healthy", "Undetermined", ...Object.values(VERDICTS)].find((one) => words.startsWith(`${one}: `)); // a service may speak another language
+  const verdict = ["Fault", "Suspect", "Healthy", "Undetermined", ...Object.values(VERDICTS)].find((one) => words.startsWith(`${one}: `)); // a service may speak another language
   return verdict ? words.slice(verdict.length + 2) : words;
 }
 
@@ -344,7 +344,7 @@ function lineOf(first) {
   const update = (row, now) => {
     if (verdict !== row.verdict) {
       verdict = row.verdict;
-      element.classList.remove("fault", "healthy", "undetermined");
+      element.classList.remove("fault", "suspect", "healthy", "undetermined");
       element.classList.add(verdict);
       state.replaceChildren(mark(verdict), VERDICTS[verdict]);
     }

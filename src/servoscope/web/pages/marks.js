@@ -4,6 +4,7 @@ import { sentence } from "./words.js";
 
 const SHAPES = {
   fault: ["M12 2 23 21.5H1Z", "M12 9v6M12 17.4v1.6"],
+  suspect: ["M12 2 23 21.5H1Z", "M12 9v6M12 17.4v1.6"],
   healthy: ["M12 1a11 11 0 1 0 0 22a11 11 0 1 0 0-22Z", "m6.5 12.5 3.8 3.8 7.2-8"],
   undetermined: ["M12 1a11 11 0 1 0 0 22a11 11 0 1 0 0-22Z", "M6 12h12"],
   failure: ["M7.4 1.5h9.2l6 6v9l-6 6H7.4l-6-6v-9Z", "M8 8l8 8M16 8l-8 8"],
@@ -15,7 +16,7 @@ const SHAPES = {
   care: ["M12 2 23 21.5H1Z", "M12 9v6M12 17.4v1.6"],
   note: ["M12 1a11 11 0 1 0 0 22a11 11 0 1 0 0-22Z", "M12 10.5v7M12 6.500v1.6"],
 };
-export const VERDICTS = { fault: translate("Fault"), undetermined: translate("Undetermined"), healthy: translate("Healthy") };
+export const VERDICTS = { fault: translate("Fault"), suspect: translate("Suspect"), undetermined: translate("Undetermined"), healthy: translate("Healthy") };
 export const STATUS = {
   failure: translate("Failure"),
   function_check: translate("Function check"),

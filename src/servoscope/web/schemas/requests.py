@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from servoscope.baseline.records import Occasion
-from servoscope.diagnosis.result import Verdict
+from servoscope.core.verdict import VerdictKind
 
 Text = Annotated[str, Field(max_length=1000)]
 Id = Annotated[str, Field(min_length=1, max_length=150)]
@@ -58,7 +58,7 @@ class FleetQuery(ApiRequest):
 
     search: Text = ""
     group: Text | None = None
-    verdict: Verdict | None = None
+    verdict: VerdictKind | None = None
 
 
 class TimeQuery(ApiRequest):
@@ -138,7 +138,7 @@ class TransitionQuery(AuditQuery):
 class DiagnosisQuery(AuditQuery):
     """The newest diagnoses with this verdict and origin."""
 
-    verdict: Verdict | None = None
+    verdict: VerdictKind | None = None
     grounds: Literal["examination", "full", "upload"] | None = None
     last: RowCount = 100
 

@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from servoscope.core.messages import MessageField
+from servoscope.core.verdict import VerdictKind
 from servoscope.design.operating_limits import OperatingLimit
-from servoscope.diagnosis.result import Verdict
 from servoscope.prognosis.forecast import Prognosis
 from servoscope.service.access import Role
 from servoscope.service.renewal import LearningProgress
@@ -153,7 +153,7 @@ class UploadDiagnosis(StorageRecord):
 
     baseline: BaselineRef
     upload: str | None = None
-    verdict: Verdict
+    verdict: VerdictKind
     summary: str
     recording: str
 
@@ -166,7 +166,7 @@ class DiagnosisRow(ApiResponse):
     number: int | None = None
     t: float
     grounds: str
-    verdict: Verdict
+    verdict: VerdictKind
     summary: str
     onset: float | None = None
     recording: str | None = None
