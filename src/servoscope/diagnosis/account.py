@@ -164,8 +164,9 @@ class Account:
         for name, ratio, part in excesses:
             yield JudgeEvidence(name, limit_evidence(ratio, part * share, len(self.baseline.sources)))
         if (change := exam.change) is not None:
-            nats = -float(np.log(SCAN_FALSE_ALARMS)) * change.excess
-            yield JudgeEvidence("change", nats, inside=True)
+            # scatter between recordings, which raises the limit, is none within one
+            raised = self.limit - evidence_limit([])
+            yield JudgeEvidence("change", raised - float(np.log(SCAN_FALSE_ALARMS)) * change.excess, inside=True)
 
 
 def limit_evidence(excess: float, false_alarms: float, recordings: int) -> float:
