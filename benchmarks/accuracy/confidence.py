@@ -35,7 +35,7 @@ def job(seed: int, learned_on: str, kind: str, ratios: dict[str, float]) -> Numb
             count[name] += int(parts @ np.linalg.solve(C, parts) <= CHI2_95_2DOF)
         for (name, told), truth in zip(said.parameters.items(), plant.theta(), strict=True):
             count[name] += int(abs(told.value - truth) <= 1.96 * told.std)
-        count["alarms"] += int(said.verdict == "fault")
+        count["alarms"] += int(said.verdict in ("suspect", "fault"))
         if [fault.parameter for fault in said.faults] == list(ratios) and ratios:
             low, high = said.faults[0].interval
             count["named"] += 1

@@ -101,7 +101,7 @@ def main() -> None:
             continue
         baseline = ss.learn(loop(words), healthy)
         told = [ss.diagnose(baseline, recording) for recording in judged]
-        found = [one.verdict == "fault" for one in told]
+        found = [one.verdict in ("suspect", "fault") for one in told]
         named = [{fault.name for fault in one.faults} for one in told]
         heads = (
             "days",

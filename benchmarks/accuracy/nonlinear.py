@@ -190,7 +190,9 @@ def methods() -> Iterator[Table]:
         alarms = [f"{sum(each[words] for each in found)} of {len(KINDS) * len(cases)}" for words, cases in CONDITIONS]
         said = [(parameter, each[parameter]) for each in found for parameter, _ in FAULTS]
         seen = [
-            (parameter, d) for parameter, d in said if d.verdict == "fault" and (d.detected_at_s or 0.0) >= FAULT_AT
+            (parameter, d)
+            for parameter, d in said
+            if d.verdict in ("suspect", "fault") and (d.detected_at_s or 0.0) >= FAULT_AT
         ]
         right = [d.faults[0] for parameter, d in seen if d.faults and d.faults[0].parameter == parameter]
         wrong = sum(bool(d.faults) for _, d in seen) - len(right)

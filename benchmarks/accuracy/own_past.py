@@ -48,7 +48,7 @@ def judged(learned: ss.Baseline, recording: ss.Recording, begin: float) -> Numbe
     told = ss.diagnose(learned, recording)
     first = told.intervals[0] if told.intervals else None
     return {
-        "found": told.verdict == "fault",
+        "found": told.verdict in ("suspect", "fault"),
         "name": " + ".join(fault.name for fault in told.faults),
         "sizes": [[fault.ratio, *fault.interval] for fault in told.faults],
         "dated": first is not None and first.onset_s[0] <= begin <= first.onset_s[2],

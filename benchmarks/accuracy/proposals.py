@@ -60,7 +60,7 @@ def judged(
     found, named, inside, widths = 0, 0, 0, []
     for k, ratio in enumerate(ratios):
         said = ss.diagnose(baseline, record(100 + k, ratio))
-        found += said.verdict == "fault"
+        found += said.verdict in ("suspect", "fault")
         if [fault.name for fault in said.faults] == ["dry_friction"]:
             low, high = said.faults[0].interval
             named += 1

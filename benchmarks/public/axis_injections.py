@@ -209,7 +209,7 @@ def inject(
             begin, _, end = diagnosis.onset_s
             wide = low - POINTS <= 1.0 + size <= high + POINTS
             inside = low <= 1.0 + size <= high, wide, begin <= at_s <= end
-        told = {name: each[i] for name, each in found.items()} | {OURS: diagnosis.verdict == "fault"}
+        told = {name: each[i] for name, each in found.items()} | {OURS: diagnosis.verdict in ("suspect", "fault")}
         together, total = [], 0.0
         for cause in diagnosis.candidates:
             if total < TOGETHER:

@@ -16,6 +16,7 @@ from tables import Table, parse_with_data, parser, show
 
 import servoscope as ss
 from servoscope.core.errors import ServoscopeError
+from servoscope.core.verdict import FOUND
 from servoscope.signals.readers import read_parts
 
 LIMIT = 1.0 / 0.1649  # of u = kp (r - y), where the duty is 1 (the authors' law)
@@ -64,10 +65,10 @@ def main() -> None:
                 rows.append((f"{arm:g} m", what, str(learned), str(error), *[""] * 4))
                 continue
             held_out = healthy[learned:][: given.count]
-            false = sum(ss.diagnose(baseline, run).verdict == "fault" for run in held_out)
+            false = sum(ss.diagnose(baseline, run).verdict in FOUND for run in held_out)
             changed = runs(folder, settings, other, arm, gains)[: given.count]
             told = [ss.diagnose(baseline, run) for run in changed]
-            found = sum(one.verdict == "fault" for one in told)
+            found = sum(one.verdict in FOUND for one in told)
             masses = [f.mass_kg for one in told for f in one.faults if f.mass_kg is not None]
             inside = sum(low <= other - own <= high for _, low, high in masses)
             median = f"{np.median([mass for mass, _, _ in masses]):.3f} kg" if masses else ""

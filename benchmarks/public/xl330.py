@@ -16,6 +16,7 @@ from tables import Table, parse_with_data, parser, show
 import servoscope as ss
 from public.servoscope_detector import OURS, with_gain
 from public.simple_detectors import detectors, judge
+from servoscope.core.verdict import FOUND
 from servoscope.learning.axis_fit import fit_axis
 from servoscope.learning.proposal import propose_columns
 from servoscope.signals.readers import list_channels
@@ -72,7 +73,7 @@ def main() -> None:
         others, changed = runs[:k] + runs[k + 1 :], with_gain(run, GAIN, CHANGED_S / run.duration_s)
         baseline = ss.learn(loop, others)
         said = [ss.diagnose(baseline, one) for one in (run, changed)]
-        alarms.setdefault(OURS, []).append((said[0].verdict == "fault", said[1].verdict == "fault"))
+        alarms.setdefault(OURS, []).append((said[0].verdict in FOUND, said[1].verdict in FOUND))
         named = ", ".join(fault.name for fault in said[1].faults) or said[1].verdict
         verdicts.append((run.name.removesuffix(".parquet"), said[0].verdict, named))
         for one in detectors(WINDOW_S, loop.cutoff):

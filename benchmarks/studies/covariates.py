@@ -147,7 +147,7 @@ def rows(count: int) -> list[tuple[str, ...]]:
     for scene, plain, recordings in judged_scenes(count):
         for name, baseline in learn_covariates(scene, plain).items():
             said = [ss.diagnose(baseline, one) for one in recordings]
-            alarms = [one.verdict == "fault" for one in said]
+            alarms = [one.verdict in ("suspect", "fault") for one in said]
             sizes = [one.faults[0].ratio for one in said[count:] if len(one.faults) == 1]
             near = sum(abs(size / scene.ratio - 1.0) <= NEAR for size in sizes)
             counts = f"{sum(alarms[:count])}", f"{sum(alarms[count:])}", f"{len(sizes)}", f"{near}"

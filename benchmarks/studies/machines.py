@@ -62,5 +62,5 @@ class Machines:
             false += [Judged.of(baseline, one) for one in self.cranfield("normal", load, "6-10")]
             if load == "40":
                 found = [Judged.of(baseline, one) for one in self.cranfield("lackLubrication1", load, "1-10")]
-        alarms = [sum(one.diagnosis.verdict == "fault" for one in each) for each in (false, found)]
+        alarms = [sum(one.diagnosis.verdict in ("suspect", "fault") for one in each) for each in (false, found)]
         return f"{alarms[0]} of {len(false)}", f"{alarms[1]} of {len(found)}"

@@ -219,7 +219,7 @@ def cranfield(data: Path) -> Iterator[Table]:
             where = {"load": load, "run": runs}
             parts = ss.read_parts(folder / f"{file}.csv", loop, where=where, by="run")
             judged = [Judged.of(baseline, part) for part in parts]
-            count = sum(one.diagnosis.verdict == "fault" for one in judged)
+            count = sum(one.diagnosis.verdict in ("suspect", "fault") for one in judged)
             names = sorted({one.diagnosis.faults[0].name for one in judged if one.diagnosis.faults})
             cells.append(f"{count} of {len(judged)}" + (f" ({', '.join(names)})" if names else ""))
             if file == "normal":

@@ -152,7 +152,7 @@ def model_error(m: Machines) -> Iterator[Table]:
         loop = changed(m.loops["qube"], model_error=share)
         pairs = [(i, j) for i in range(3) for j in range(3) if i != j]
         judged = [Judged.of(ss.learn(loop, [m.qube[j]]), m.qube[i]) for i, j in pairs]
-        false = sum(one.diagnosis.verdict == "fault" for one in judged)
+        false = sum(one.diagnosis.verdict in ("suspect", "fault") for one in judged)
         pump = ss.learn(changed(m.loops["eha-pump"], model_error=share), [m.pump(1, 4)])
         rows.append(
             (

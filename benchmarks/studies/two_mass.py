@@ -78,7 +78,7 @@ def product_score(
     found, named, wrong, inside = [], 0, 0, 0
     for day, change in zip(faulty, changes, strict=True):
         said = ss.diagnose(baseline, day)
-        found.append(said.verdict == "fault")
+        found.append(said.verdict in ("suspect", "fault"))
         if not said.faults:
             continue
         expected, fault = right_name(change), said.faults[0]
