@@ -139,7 +139,7 @@ class Account:
 
     def _judges(self, exam: Examination) -> Iterator[JudgeEvidence]:
         """Yield what each judge says of an examination, of what the baseline shares the false alarms among."""
-        T2, level = (float(one.value.max(where=exam.ready, initial=0.0)) for one in exam.statistics[:2])
+        T2, level = (float(statistic.value.max(where=exam.ready, initial=0.0)) for statistic in exam.statistics[:2])
         duration_s, limit = exam.recording.duration_s, self._limit_of_year
         yearly = self.baseline.loop.monitor.false_alarms_per_year
         rare = -float(np.log(min(yearly * duration_s / SECONDS_PER_YEAR, 1.0)))

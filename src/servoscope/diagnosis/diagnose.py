@@ -143,8 +143,8 @@ def diagnose(
     learned = Baseline.of(baseline)
     if isinstance(recording, list):
         told = list[Diagnosis]()
-        for one in recording:
-            told.append(diagnose(baseline, one, progress, point=point, before=before))
+        for next_recording in recording:
+            told.append(diagnose(baseline, next_recording, progress, point=point, before=before))
             before = told[-1].verdict
         return tuple(told)
     judged = as_recording(recording, learned.loop)
@@ -274,8 +274,8 @@ def diagnose_examination(
     """
     recording, baseline, last = exam.recording, exam.baseline, exam.evaluations - 1
     told = Account(baseline).verdict(exam, before, inside=inside)
-    verdict, found, at, features = told.kind, told.kind in FOUND, last, exam.features
-    alarm = first_alarm(exam, progress) if found else None
+    verdict, is_above, at, features = told.kind, told.kind in FOUND, last, exam.features
+    alarm = first_alarm(exam, progress) if is_above else None
     intervals: tuple[FaultInterval, ...] = ()
     onset: Onset | None = None
     if alarm is not None:
@@ -286,7 +286,7 @@ def diagnose_examination(
         verdict = "healthy" if is_repaired(exam, intervals) else verdict
         warnings = _all_warnings(exam, doubts)
         headline = build_headline(verdict, intervals, {}, warnings, baseline.point)
-    elif found and (change := next(findings(exam, "change"), None)) is not None:
+    elif is_above and (change := next(findings(exam, "change"), None)) is not None:
         unknown = (Candidate(name=UNKNOWN, probability=1.0),)
         intervals = (FaultInterval(detected_at_s=change.from_s, probability=1.0, candidates=unknown),)
         headline, warnings = change.text, _all_warnings(exam, [])
@@ -301,7 +301,7 @@ def diagnose_examination(
     end = corrected_trace(exam, correction, slice(max(last, 0), last + 1))
     explained = end if at == last else corrected_trace(exam, correction, slice(at, at + 1))
     reasons = build_reasons(exam, explained, interval) if alarm is not None and interval is not None else ()
-    if found and features is not None and (changed := features.changed) is not None:
+    if is_above and features is not None and (changed := features.changed) is not None:
         reasons = (*reasons, *features.reasons(changed, alone=alarm is None))
     if verdict in FOUND and told.recordings:
         reasons = (*reasons, how_sure(told))
