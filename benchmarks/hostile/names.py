@@ -1,0 +1,38 @@
+"""Names of columns as makers' tools write them: logs whose r, u and y are proposed right, refused, or wrong in silence."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from collections import Counter
+from pathlib import Path
+
+from named_logs import Outcome, find_outcome, named_logs
+
+
+def main() -> int:
+    """Count the outcomes, those of makers that are held out of tuning by themselves."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--each", type=int, default=10, help="logs per maker")
+    parser.add_argument("--maker", action="append", default=[], help="only this one, repeatable")
+    parser.add_argument("--tuned", action="store_true", help="only makers that are not held out")
+    parser.add_argument("--json", action="store_true", help="print the counts as JSON")
+    given = parser.parse_args()
+    counts: dict[str, Counter[str]] = {"tuned": Counter(), "held out": Counter()}
+    makers: dict[str, Counter[str]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for log in named_logs(given.each, given.maker):
+            if given.tuned and log.held_out:
+                continue
+            outcome, said = find_outcome(log, Path(folder))
+            counts["held out" if log.held_out else "tuned"][outcome] += 1
+            makers.setdefault(log.maker, Counter())[outcome] += 1
+            if outcome is not Outcome.RIGHT and not given.json and not log.held_out:
+                print(f"{log.file}: {outcome}: {said} (right: {log.words})")
+    if given.json:
+        print(json.dumps(counts))
+        return 0
+    for name, found in [*makers.items(), *counts.items()]:
+        print(f"{name:14} {sum(found.values()):4}  " + ", ".join(f"{found[o]} {o}" for o in Outcome if found[o]))
+    return 0
