@@ -1,4 +1,4 @@
-"""Names of columns as makers' tools write them: logs whose r, u and y are proposed right, refused, or wrong in silence."""
+"""Names of columns as makers' tools write them: how often r, u and y are proposed right, or wrong in silence."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ MAKERS = tomllib.loads(Path(__file__).with_name("makers.toml").read_text(encodin
 TO_SI = {
     **dict.fromkeys(("", "m", "rad", "rad/s", "counts", "inc", "qc", "pulse", "%", "A", "V", "N", "Nm", "s"), 1.0),
     **dict.fromkeys(("mm", "mA", "ms"), 1e-3), **dict.fromkeys(("um", "us"), 1e-6),
-    **dict.fromkeys(("deg", "Grad", "deg/s"), np.pi / 180.0), "rev": 2.0 * np.pi,
+    **dict.fromkeys(("deg", "Grad", "deg/s"), np.pi / 180.0), "rev": 2.0 * np.pi, "rpm": np.pi / 30.0,
 }  # fmt: skip
 # amplitude, and the middles about which it moves
 SPAN: dict[str, tuple[float, tuple[float, ...]]] = {
@@ -37,7 +37,8 @@ SPAN: dict[str, tuple[float, tuple[float, ...]]] = {
 }  # fmt: skip
 EFFORT = {"": 1.0, "A": 3.0, "mA": 900.0, "%": 40.0, "Nm": 4.0, "V": 5.0, "N": 150.0}
 EFFORT_WORDS = {  # what an effort may be measured in, by what its name says
-    r"(?i)curr|strom|^i[ _]|iq|icmd|\.i$|IL\.|ISQ|q_A": ("A", "mA", "%", ""), r"(?i)torque|moment|tau|tor|TRQ": ("Nm", "%", ""),
+    r"(?i)curr|strom|^i[ _]|iq|icmd|\.i$|IL\.|ISQ|q_A": ("A", "mA", "%", ""),
+    r"(?i)torque|moment|tau|tor|TRQ": ("Nm", "%", ""),
     r"(?i)volt|spannung": ("V", "%", ""), r"(?i)pwm|load|duty": ("%", ""),
 }  # fmt: skip
 STYLES = ("{} [{}]", "{} ({})", "{}_{}", "{} / {}", "row", "none")
@@ -93,10 +94,15 @@ def move(rng: np.random.Generator, steps: int, dt: float) -> FloatArray:
 
 @cache
 def simulate(rig: str, seed: int) -> dict[str, FloatArray]:
-    """Return the signals of a loop, of unit amplitude: a position axis (1 kHz), a speed axis, a slow process (10 Hz)."""
+    """Return the signals of a loop, of unit amplitude: position or speed of an axis (1 kHz), a slow process (10 Hz)."""
     rng = np.random.default_rng([seed, len(rig)])
     dt, steps = (0.1, 20000) if rig == "process" else (1e-3, 32000)
-    inertia, viscous, dry, load = 0.02 * rng.uniform(0.7, 1.4), 0.03, 0.08 * rng.uniform(0.5, 1.5), rng.uniform(-0.1, 0.1)
+    inertia, viscous, dry, load = (
+        0.02 * rng.uniform(0.7, 1.4),
+        0.03,
+        0.08 * rng.uniform(0.5, 1.5),
+        rng.uniform(-0.1, 0.1),
+    )
     if rig == "process":
         r = np.repeat(np.clip(np.cumsum(rng.normal(0.0, 0.6, 80)), -1.0, 1.0), steps // 80)
     else:
@@ -204,6 +210,7 @@ def make(maker: dict[str, Any], number: int, *, held_out: bool) -> NamedLog:
             role = {"u_act": "u"}.get(kind, kind)
             if role in "ruy" and any(name in n.split("|") for n in names):
                 unit = shown_effort if role == "u" else shown_position
+                unit = "rpm" if re.search(r"(?<!e)rpm$", name) else unit
                 one.setdefault(role, []).append(scaled * TO_SI[unit])
         answers += [(one["r"][0], u, one["y"][0]) for u in one["u"]]
         words.append(", ".join(f"{role}={before}{name}" for role, name in zip("ruy", names, strict=True)))
@@ -247,7 +254,7 @@ def named_logs(each: int = 10, makers: Sequence[str] = ()) -> Iterator[NamedLog]
 
 
 def find_outcome(log: NamedLog, folder: Path) -> tuple[Outcome, str]:
-    """Write a log, let its columns be proposed, read it, and compare with its answers; return also what was proposed."""
+    """Write a log, let its columns be proposed, read it, compare it with its answers; return what was proposed, too."""
     path = log.write(folder)
     try:
         columns = propose_columns(path, list_channels(path))
@@ -255,12 +262,15 @@ def find_outcome(log: NamedLog, folder: Path) -> tuple[Outcome, str]:
         found = read(path, columns=columns)
     except ServoscopeError as error:
         return Outcome.REFUSED, str(error)
+    asked = columns.reference == "r" and "r" not in log.header  # no reference is proposed: the user is asked for it
     for t, r, u, y in log.answers:
         if len(found.t) == len(t) and np.allclose(found.t - found.t[0], t, rtol=1e-6, atol=1e-6):
-            each = [_ratio(a, b) for a, b in ((found.r, r), (found.u, u), (found.y, y))]
+            each = [_ratio(a, b) for a, b in ((found.r, r), (found.u, u), (found.y, y))[asked:]]
             if all(x is not None for x in each):
+                if asked:
+                    return Outcome.REFUSED, said
                 return (Outcome.RIGHT if _fits(each) else Outcome.UNIT), said
-    return (Outcome.WRONG if columns.reference else Outcome.REFUSED), said
+    return Outcome.WRONG, said
 
 
 def _ratio(found: FloatArray, right: FloatArray) -> float | None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, Field, field_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from servoscope.core.settings import NonEmptyStr, Settings
 
@@ -73,6 +73,14 @@ class Columns(Settings):
         """Rate [Hz] of the rows of a file without a time column, as ``time = "row / 200"`` says; else None."""
         match = ROW_TIME.fullmatch(self.time or "")
         return float(match[1]) if match is not None else None
+
+    @model_validator(mode="after")
+    def _two_signals(self) -> Self:
+        """Refuse one column as u and y: a torque that moves y is not y."""
+        u, *ys = (text.rpartition("* ")[2].strip("`") for text in (self.input, *self.outputs))
+        if u in ys:
+            raise ValueError(f"input and output are one column, {u!r}: name the column of y, which the input moves")
+        return self
 
     @property
     def outputs(self) -> tuple[str, ...]:

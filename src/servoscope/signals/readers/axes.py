@@ -8,6 +8,7 @@ from collections import defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
+from servoscope.signals.readers.column_words import describe_name
 from servoscope.signals.readers.guess_columns import TIME_UNITS, guess_columns
 from servoscope.signals.readers.recording_file import ChannelInfo
 from servoscope.signals.readers.units import split_unit
@@ -20,8 +21,7 @@ MARK = re.compile(
 ROTATIONS = {"roll": "x", "pitch": "y", "yaw": "z"}  # which axis each turns about
 
 MAX_AXES = 32  # numbers in more names than that count something else, samples for example
-# the largest over the smallest value, below which a positive column is a supply rather than a signal
-MAX_SUPPLY_RATIO = 2.0
+MAX_SUPPLY_RATIO = 1.05  # largest over smallest value of a positive column, no motion, that is a supply or temperature
 
 
 def signal_names(channels: Sequence[ChannelInfo]) -> list[str]:
@@ -46,7 +46,10 @@ def signal_names(channels: Sequence[ChannelInfo]) -> list[str]:
         channel_info.name for channel_info in named if channel_info.name in clocks or not math.isnan(channel_info.min)
     ]
     supplies = {
-        channel.name for channel in channels if 0.0 < channel.min < channel.max < MAX_SUPPLY_RATIO * channel.min
+        channel.name
+        for channel in channels
+        if 0.0 < channel.min < channel.max < MAX_SUPPLY_RATIO * channel.min
+        and describe_name(channel.name).quantity not in ("position", "speed")
     } - clocks
     moving = [name for name in names if name not in supplies]
     lost = {"u", "y"} & guess_columns(names).keys() - guess_columns(moving).keys()

@@ -10,7 +10,7 @@ from typing import Any
 
 from servoscope.core.errors import EmptyRecordingError, RecordingError
 from servoscope.models.loop import TextLayout
-from servoscope.signals.readers.guess_columns import WORDS
+from servoscope.signals.readers.column_words import known_words
 from servoscope.signals.readers.layout import HEAD_ROWS, THOUSANDS, check_names, count_numeric, find_table
 from servoscope.signals.readers.table import NULL_TEXTS, Table, TableFile, is_number, one_line_errors
 
@@ -267,7 +267,7 @@ def _detect_encoding(head: bytes) -> str:
     except UnicodeDecodeError:
         # two bytes of Chinese are two letters of Latin: words that names of columns have tell
         told = lines.decode("gb18030", errors="replace")
-        words = (word for synonyms in WORDS.values() for word in synonyms if CHINESE_CHARACTER.search(word))
+        words = (word for word in known_words() if CHINESE_CHARACTER.search(word))
         return "gb18030" if any(word in told for word in words) else "latin-1"
     return "utf-8-sig"
 

@@ -16,9 +16,14 @@ ANGLES = {
     "degree": DEG,
     "degrees": DEG,
     "grad": DEG,
+    "Grad": DEG,
     "rev": 2 * math.pi,
 }
+COUNTS = {
+    unit: 1.0 for unit in ("inc", "incr", "counts", "cts", "ticks", "pulse", "pulses", "steps", "qc")
+}  # of an encoder
 SPEEDS = {
+    **{f"{unit}/s": 1.0 for unit in COUNTS},
     **{f"{unit}/s": factor for unit, factor in {**LENGTHS, **ANGLES}.items()},
     **{f"{unit}/min": factor / 60.0 for unit, factor in {**LENGTHS, **ANGLES}.items()},
     **{"rpm": RPM, "1/min": RPM, "U/min": RPM, "rev/min": RPM, "tr/min": RPM, "min-1": RPM, "r/min": RPM},
@@ -35,6 +40,7 @@ INPUTS = {
         "kPa": 1e3,
         "MPa": 1e6,
         "%": 1.0,
+        "pct": 1.0,
         "W": 1.0,
         "kW": 1e3,
     },
@@ -55,10 +61,6 @@ OTHER_UNITS = (
     "-",
     "Hz",
     "kHz",
-    "inc",
-    "counts",
-    "incr",
-    "ticks",
     "m/s²",
     "m/s^2",
     "rad/s²",
@@ -66,11 +68,13 @@ OTHER_UNITS = (
     "1",
     "V/s",
 )
-FACTORS = {**LENGTHS, **ANGLES, **SPEEDS, **INPUTS}
+FACTORS = {**LENGTHS, **ANGLES, **COUNTS, **SPEEDS, **INPUTS}
 BRACKETED_UNIT = re.compile(r"^(.*?)\s*(?:\[\s*([^\[\]]+?)\s*\]|\(\s*([^()]+?)\s*\))\s*$")
 INDEXED = re.compile(r"\w\[\d+\]$")  # an element of an array, q[1], is no quantity without a unit, q [1]
 QUANTITY = re.compile(r"([-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s].*)")  # 12.5 mm
-BARE_UNIT = re.compile(r"^(.+?)(?:[_ ]|\s*/\s*)([A-Za-zµμ°%/]{1,5})$")  # a unit without brackets: pos_mm, t/ms
+BARE_UNIT = re.compile(r"^(.+?)(?:[_ ]|\s*/\s*)([A-Za-zµμ°%/]{1,9})$")  # a unit without brackets: pos_mm, t/ms
+
+BARE_RATE = re.compile(r"^(.+?)[_ ]([A-Za-zµμ]{1,4})_(s|min)$")  # vel_mm_s
 
 
 def with_unit(name: str, unit: str) -> str:
@@ -97,9 +101,14 @@ def split_unit(name: str) -> tuple[str, str]:
     match = BRACKETED_UNIT.match(name)
     if match is not None and is_unit(unit := match[2] or match[3]):
         return (name, "") if INDEXED.search(name) else (match[1], unit)
+    if name in SPEEDS:  # rpm
+        return name, name
+    rate = BARE_RATE.match(name)
+    if rate is not None and (unit := f"{rate[2]}/{rate[3]}") in SPEEDS:
+        return rate[1], unit
     loose = BARE_UNIT.match(name)
     # a single letter is a name more often than a unit: joint_A, r_m
-    if loose is not None and is_unit(loose[2]) and (len(loose[2]) > 1 or loose[2] in "s°%"):
+    if loose is not None and is_unit(loose[2]) and (len(loose[2]) > 1 or loose[2] in "s°%" or " / " in name):
         return loose[1], loose[2]
     return name, ""
 
