@@ -221,7 +221,11 @@ def print_channels(out: Console, path: Path, channels: Sequence[ChannelInfo], ra
     from servoscope.signals.readers.axes import moving_axes, signals_of_one_axis
     from servoscope.signals.readers.guess_columns import format_mapping, guess_mapping
 
-    print_title(out, path.name, f": {say('cli.columns', count=len(channels))}")
+    print_title(
+        out,
+        path.name,
+        f": {say('cli.columns', count=len(channels), rows=max((channel.rows for channel in channels), default=0))}",
+    )
     limits = [[f"{x:.6g}" if math.isfinite(x) else DASH for x in (c.min, c.max)] for c in channels]
     rows = [(c.name, c.dtype, *limit) for c, limit in zip(channels, limits, strict=True)]
     print_table(out, ("column", "type", "smallest", "largest"), rows, words=2)

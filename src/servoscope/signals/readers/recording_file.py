@@ -38,7 +38,8 @@ TIME_NAMES = ("t", "time", "zeit", "timestamp", "time_s", "seconds", "datetime",
 class ChannelInfo:
     """A column of a file: its name, Arrow type, and smallest and largest number (NaN if it holds none).
 
-    `clock`: where a file has several rasters, the column with the time stamps of this one, which may be itself.
+    `clock`: where a file has several rasters, the column with the time stamps of this one, which may be itself; `rows`:
+    how many it has.
     """
 
     name: str
@@ -46,6 +47,7 @@ class ChannelInfo:
     min: float
     max: float
     clock: str = ""
+    rows: int = 0
 
 
 def list_channels(path: str | Path, text: TextLayout | None = None) -> list[ChannelInfo]:
@@ -55,10 +57,12 @@ def list_channels(path: str | Path, text: TextLayout | None = None) -> list[Chan
     """
     opened = open_file(path, text)
     ranges: dict[str, list[tuple[float, float]]] = {name: [] for name in opened.columns}
+    rows = dict.fromkeys(opened.columns, 0)
     types: dict[str, list[str]] = {name: [] for name in opened.columns}
     for table in (table for names in opened.channel_groups or [opened.columns] for table in opened.iter_chunks(names)):
         for name, column in table.columns.items():
             types[name].append(str(column.type))
+            rows[name] += len(column)
             try:
                 numbers = number_column(table, name, "channel")
             except RecordingError:
@@ -68,7 +72,7 @@ def list_channels(path: str | Path, text: TextLayout | None = None) -> list[Chan
                 ranges[name].append((float(numbers.min()), float(numbers.max())))
     clocks = raster_clocks(opened)
     listed = (_channel_info(name, types[name], ranges[name]) for name in opened.columns)
-    return [replace(channel, clock=clocks.get(channel.name, "")) for channel in listed]
+    return [replace(channel, clock=clocks.get(channel.name, ""), rows=rows[channel.name]) for channel in listed]
 
 
 def _channel_info(name: str, types: list[str], ranges: list[tuple[float, float]]) -> ChannelInfo:
