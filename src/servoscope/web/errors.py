@@ -19,6 +19,7 @@ from servoscope.core.texts import clean_text, clean_texts
 from servoscope.web.schemas.responses import JsonObject, Problem
 
 PROBLEM_TYPE = "application/problem+json"
+MAX_ERRORS = 20  # that the answer to a refused request names
 FRAMEWORK_SCHEMAS = ("HTTPValidationError", "ValidationError")  # of the framework, whose answers are replaced here
 
 
@@ -84,7 +85,8 @@ def install_error_handlers(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     async def _invalid(request: Request, error: RequestValidationError) -> Response:
         errors = [
-            {"where": ".".join(map(str, problem["loc"])), "what": str(problem["msg"])} for problem in error.errors()
+            {"where": ".".join(map(str, problem["loc"])), "what": str(problem["msg"])}
+            for problem in error.errors()[:MAX_ERRORS]
         ]
         detail = f"{errors[0]['where']}: {errors[0]['what']}" if errors else say("web.invalid")
         return problem_response(422, detail, request.url.path, errors)

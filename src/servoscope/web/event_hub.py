@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import secrets
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -23,9 +24,10 @@ from servoscope.service.assets.status import AssetStatus, ServiceStatus
 from servoscope.service.store import Row, Store, tables
 from servoscope.web.schemas.assets import AssetRow, ServiceRow, TransitionRow
 from servoscope.web.schemas.responses import DiagnosisRow
-from servoscope.web.statuses import StatusEntry, asset_statuses, read_statuses, service_statuses
+from servoscope.web.statuses import FleetTable, StatusEntry, asset_statuses, read_statuses, service_statuses
 
 EVERY_S = 0.5
+ROWS_PER_EVENT = 200  # assets in one event
 MAX_EVENTS = 2000  # that a reader may be behind
 MAX_TEXTS = 100  # of a tick, one for each earlier tick at which a reader was last served
 MAX_RANGES_PER_QUERY = 200  # pairs of asset and number
@@ -51,10 +53,25 @@ class EventHub:
     statuses: dict[str, StatusEntry] = field(default_factory=dict)
     events: deque[HubEvent] = field(default_factory=lambda: deque(maxlen=MAX_EVENTS))
     last_number: int = 0  # of the events
+    fleet: FleetTable = field(init=False)
+    _started: str = field(default_factory=lambda: secrets.token_hex(4))  # marks of another run mean nothing
     _ticks: dict[str, int] = field(default_factory=dict)  # at which each asset was last new
     # the newest tick's event by the reader's last tick, language and clock
     _texts: dict[tuple[int, str, object], bytes] = field(default_factory=dict)
     _change: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def __post_init__(self) -> None:
+        self.fleet = FleetTable(self.store)
+
+    @property
+    def mark(self) -> str:
+        """What a reader is given who knows all until now."""
+        return f"{self._started}-{self.tick}"
+
+    def tick_at(self, mark: str) -> int:
+        """Return the tick of a mark; -1 where it is none of this run: its reader needs everything."""
+        started, _, tick = mark.partition("-")
+        return int(tick) if started == self._started and tick.isdecimal() and int(tick) <= self.tick else -1
 
     async def run(self) -> None:
         """Poll until cancelled."""
@@ -117,13 +134,16 @@ class EventHub:
                 AssetRow.from_status(stored.name, stored.at, status)
                 for stored, status in asset_statuses(self.statuses[name] for name in names)
             ]
-            if assets or tick < 0:
-                ordered = sorted(assets, key=lambda row: (-row.severity, row.asset))
-                rows = ",".join(row.model_dump_json() for row in ordered)
-                text = f'event: assets\ndata: {{"now":{now!r},"assets":[{rows}]}}\n\n'.encode()
             services = service_statuses(self.statuses[name] for name in names)
             if shown := [ServiceRow.from_status(stored.name, status) for stored, status in services]:
                 text += format_sse("services", {"now": now, "services": shown})
+            if assets or tick < 0:
+                ordered = sorted(assets, key=lambda row: (-row.severity, row.asset))
+                for k in range(0, max(len(ordered), 1), ROWS_PER_EVENT):
+                    rows = ",".join(row.model_dump_json() for row in ordered[k : k + ROWS_PER_EVENT])
+                    # whose connection ends before the last one does not have them all
+                    mark = f"id: {self.mark}\n" if k + ROWS_PER_EVENT >= len(ordered) else ""
+                    text += f'{mark}event: assets\ndata: {{"now":{now!r},"assets":[{rows}]}}\n\n'.encode()
             self._texts[key] = text
         return self._texts[key]
 

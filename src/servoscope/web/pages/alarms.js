@@ -22,6 +22,7 @@ export async function show(main, { session, signal, linked, values }) {
   const all = h("button", { type: "button", hidden: true, onclick: () => answerAll() });
   let alarms = [];
   let now = 0;
+  let mark = "";
 
   main.replaceChildren(
     h("div", { class: "head" }, h("h1", {}, "Alarms"), h("span", { class: "gap" }), all, state, search),
@@ -88,7 +89,7 @@ export async function show(main, { session, signal, linked, values }) {
 
   async function look() {
     const [found, steps] = await Promise.all([get("/alarms", signal), get(query("/alarms/history", { asset, last: 100 }), signal)]);
-    ({ alarms, now } = found);
+    ({ alarms, now, mark } = found);
     flood.hidden = !found.flood;
     if (found.flood) tell(flood, `Alarm flood since ${moment(found.flood.since)}: ${found.flood.counted} new alarms, ${found.flood.held} held back.`);
     draw();
@@ -103,7 +104,7 @@ export async function show(main, { session, signal, linked, values }) {
       look().catch(() => {}); // the stream says that the service is gone
     }, OFTEN_MS);
   };
-  follow("", ["alarm", "services"], soon, linked, signal);
+  follow("", ["alarm", "services"], soon, linked, signal, mark);
   signal.addEventListener("abort", () => clearTimeout(timer));
 }
 

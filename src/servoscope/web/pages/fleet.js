@@ -5,6 +5,7 @@ import { follow } from "./live.js";
 import { mark, say, VERDICTS } from "./marks.js";
 import { DASH, duration, moment, multiple, plain, sentence, signed, size } from "./words.js";
 
+const PAGE = 200; // assets that are asked for, and shown in the table, at a time
 const STALE_S = 10; // without a sample for so long, the age is told
 const ORDER_MS = 5000; // between two changes of the order: rows must not run away from whoever reads them
 // Name, width, and the rows that have something in it, if it goes where no row has.
@@ -44,7 +45,7 @@ const QUESTIONS = {
 const OPEN = ["unacknowledged", "returned_unacknowledged", "latched_unacknowledged"];
 
 export async function show(main, { signal, linked, values }) {
-  const assets = new Map(); // name -> { row, tile, line }
+  const assets = new Map(); // name -> { row, tile, shown, line }; a line from when it is in the table on
   const filter = { verdict: values.get("verdict") ?? "", search: values.get("search") ?? "", group: values.get("group") ?? "", order: values.get("order") ?? "worst", source: values.get("source") ?? "", question: values.get("show") ?? "" };
   const map = h("div", { class: "map" });
   const body = h("div", { role: "rowgroup", class: "rows" });
@@ -56,7 +57,8 @@ export async function show(main, { signal, linked, values }) {
   const orders = h("select", { "aria-label": "Order" }, Object.entries(ORDERS).map(([key, [words]]) => h("option", { value: key }, words)));
   orders.value = filter.order in ORDERS ? filter.order : "worst";
   const grid = h("div", { class: "grid fleet", tabindex: "0", role: "table", "aria-label": "Assets, worst first" });
-  let [now, configured] = [0, 0];
+  let [now, configured, most, loading] = [0, 0, PAGE, false];
+  const more = h("button", { type: "button", class: "filter", hidden: true, onclick: () => ((most += PAGE), order(true)) }, "Show more");
   // A phone shows machines first, and the rest when it is asked for.
   const unfold = () => set(sheet, "aria-expanded", String(main.classList.toggle("unfolded")));
   const sheet = h("button", { type: "button", class: "filter sheet", "aria-expanded": "false", onclick: unfold }, "Filters and map");
@@ -67,6 +69,7 @@ export async function show(main, { signal, linked, values }) {
     sources.element,
     map,
     grid,
+    more,
     none,
   );
   grid.append(
@@ -76,7 +79,7 @@ export async function show(main, { signal, linked, values }) {
   orders.addEventListener("change", () => ((filter.order = orders.value), chosen(), order(true)));
   search.addEventListener("input", () => ((filter.search = search.value), chosen()));
   groups.addEventListener("change", () => ((filter.group = groups.value), chosen()));
-  search.addEventListener("keydown", (event) => event.key === "Enter" && [...assets.values()].find((one) => !one.line.element.hidden)?.line.name.click());
+  search.addEventListener("keydown", (event) => event.key === "Enter" && body.querySelector(".line:not([hidden]) .name a")?.click());
   map.addEventListener("keydown", walk);
 
   function filters() {
@@ -117,9 +120,10 @@ export async function show(main, { signal, linked, values }) {
 
   function showIfWanted(one) {
     const shown = wanted(one);
-    if (one.line.element.hidden !== shown) return shown;
+    if (one.shown === shown) return shown;
+    one.shown = shown;
     one.tile.classList.toggle("off", !shown);
-    one.line.element.hidden = !shown;
+    if (one.line) one.line.element.hidden = !shown;
     return shown;
   }
 
@@ -136,7 +140,9 @@ export async function show(main, { signal, linked, values }) {
     for (const [key, button] of counts.made) set(button, "aria-pressed", String(key in QUESTIONS ? filter.question === key : !filter.question && filter.verdict === key));
     const told = new URLSearchParams(Object.entries({ verdict: filter.verdict, search: filter.search, group: filter.group, source: filter.source, show: filter.question, order: filter.order === "worst" ? "" : filter.order }).filter(([, value]) => value));
     history.replaceState(null, "", told.size ? `/?${told}` : "/");
+    most = PAGE;
     sift();
+    order(true);
   }
 
   // Rows are put where they belong, but not under somebody's hands.
@@ -145,8 +151,14 @@ export async function show(main, { signal, linked, values }) {
     const [words, key] = ORDERS[orders.value];
     set(grid, "aria-label", `Assets, ${words[0].toLowerCase()}${words.slice(1)}`);
     const by = (a, b) => (key(a.row) < key(b.row) ? -1 : key(a.row) > key(b.row) ? 1 : 0);
-    const worst = [...assets.values()].sort((a, b) => faulty(a.row) - faulty(b.row) || by(a, b) || rank(b.row) - rank(a.row) || (a.row.asset < b.row.asset ? -1 : 1));
-    worst.forEach(({ line }, i) => body.children[i] !== line.element && body.insertBefore(line.element, body.children[i] ?? null));
+    const worst = [...assets.values()].filter((one) => one.shown).sort((a, b) => faulty(a.row) - faulty(b.row) || by(a, b) || rank(b.row) - rank(a.row) || (a.row.asset < b.row.asset ? -1 : 1));
+    worst.slice(0, most).forEach((one, i) => {
+      if (!one.line) (one.line = lineOf(one.row)).update(one.row, now);
+      const { element } = one.line;
+      if (body.children[i] !== element) body.insertBefore(element, body.children[i] ?? null);
+    });
+    while (body.children.length > Math.min(worst.length, most)) body.lastChild.remove();
+    more.hidden = worst.length <= most;
   }
 
   function chart() {
@@ -182,25 +194,28 @@ export async function show(main, { signal, linked, values }) {
     for (const row of rows) {
       const known = assets.get(row.asset);
       if (!known) {
-        const one = { row, tile: h("a", { class: "tile", href: `/assets/${encodeURIComponent(row.asset)}` }), line: lineOf(row) };
+        const one = { row, tile: h("a", { class: "tile", href: `/assets/${encodeURIComponent(row.asset)}` }) };
         assets.set(row.asset, one);
         dress(one);
         fresh = true;
-      } else {
+      } else if (row.at >= known.row.at) {
         fresh ||= known.row.group !== row.group;
         const changed = known.row.verdict !== row.verdict || known.row.summary !== row.summary || known.row.alarms.length || row.alarms.length;
         known.row = row;
         if (changed) dress(known);
       }
-      assets.get(row.asset).line.update(row, now);
-    }
-    if (fresh) {
-      chart();
-      order(true);
+      const one = assets.get(row.asset);
+      one.line?.update(one.row, now);
     }
     recount();
     fold();
     sift();
+    if (fresh && !loading) draw();
+  }
+
+  function draw() {
+    chart();
+    order(true);
   }
 
   // What is empty for all takes no room.
@@ -213,7 +228,7 @@ export async function show(main, { signal, linked, values }) {
     grid.style.setProperty("--columns", COLUMNS.filter((_, i) => !empty[i]).map(([, width]) => width).join(" "));
   }
 
-  const first = await get("/assets", signal);
+  const first = await get(`/assets?limit=${PAGE}`, signal);
   now = first.now;
   configured = first.configured;
   take(first.assets);
@@ -227,13 +242,18 @@ export async function show(main, { signal, linked, values }) {
     },
     linked,
     signal,
+    first.mark,
   );
   const timer = setInterval(() => order(), ORDER_MS);
   const clock = setInterval(() => {
     now += 1;
-    for (const { row, line } of assets.values()) line.age(row, now);
+    for (const { row, line } of assets.values()) line?.age(row, now);
   }, 1000);
   signal.addEventListener("abort", () => [timer, clock].forEach(clearInterval));
+  loading = true;
+  for (let offset = PAGE; offset < first.total; offset += PAGE) take((await get(`/assets?limit=${PAGE}&offset=${offset}`, signal)).assets);
+  loading = false;
+  if (first.total > PAGE) draw();
 }
 
 // What a mark on the map says: verdict by shape and colour, an alarm to answer by its frame.

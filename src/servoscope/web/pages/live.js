@@ -1,9 +1,11 @@
 // Live updates: one stream per page, joined to at most one call per drawn frame; silent while the page is hidden.
+import { query } from "./api.js";
 
 const QUIET_S = 60.0; // without news: the server is there, the service perhaps not
 
 // Calls `heard({ event: [data, ...] })`. `state` hears "live", "quiet" or "lost"; the browser itself connects again.
-export function follow(path, events, heard, state, signal) {
+// `mark`: of what is known already, which is not sent once more.
+export function follow(path, events, heard, state, signal, mark = "") {
   let waiting = {};
   let wanted = 0;
   let source = null;
@@ -23,7 +25,7 @@ export function follow(path, events, heard, state, signal) {
     if (last) document.documentElement.dataset.told = last;
   };
   const open = () => {
-    source = new EventSource(`/api/v1/live${path}`);
+    source = new EventSource(`/api/v1/live${query(path, { since: mark })}`);
     source.onopen = judge;
     source.onerror = () => {
       state("lost");
@@ -31,6 +33,7 @@ export function follow(path, events, heard, state, signal) {
     };
     for (const name of events) {
       source.addEventListener(name, (event) => {
+        mark = event.lastEventId || mark;
         (waiting[name] ??= []).push(JSON.parse(event.data));
         wanted ||= requestAnimationFrame(flush);
       });

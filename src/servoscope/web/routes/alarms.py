@@ -28,12 +28,14 @@ COMMAND_POLL_S = 0.1
 @router.get("/alarms")
 def list_alarms(context: ContextDep, query: Annotated[AssetQuery, Query()]) -> schemas.AlarmList:
     """List the alarms that are not normal, the most urgent first."""
+    mark = context.event_hub.mark
     statuses = read_statuses(context.store, query.assets or None)
     rows = [row for stored in statuses.values() for row in schemas.alarm_rows(stored.name, stored.status.alarms)]
     rows.sort(key=lambda row: (not row.unacknowledged, -row.rank, -row.since, row.asset, row.alarm))
     floods = (status.flood for _, status in service_statuses(statuses.values()))
     return schemas.AlarmList(
         now=time.time(),
+        mark=mark,
         alarms=[_with_advice(context, row, statuses[row.asset].status) for row in rows],
         flood=next((flood for flood in floods if flood.since is not None), None),
     )

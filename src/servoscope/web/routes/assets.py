@@ -74,29 +74,38 @@ def build_asset_detail(context: Context, asset: str, at: float, status: AssetSta
 
 @router.get("/assets")
 def list_assets(context: ContextDep, query: Annotated[FleetQuery, Query()]) -> schemas.FleetStatus:
-    """List the assets, the most urgent first."""
-    statuses = read_statuses(context.store).values()
-    rows = [
-        schemas.AssetRow.from_status(status_entry.name, status_entry.at, status)
-        for status_entry, status in asset_statuses(statuses)
-    ]
+    """List the assets, the most urgent first; of many, a page at a time."""
+    mark, fleet = context.event_hub.mark, context.event_hub.fleet
+    fleet.read(anew=query.limit is None)
+    lines, services = fleet.lines, read_statuses(context.store, fleet.services)
     wanted = [
-        row
-        for row in rows
-        if query.search.casefold() in f"{row.asset} {row.group} {row.summary}".casefold()
-        and query.group in (None, row.group)
-        and query.verdict in (None, row.verdict)
+        line.asset for line in lines if query.group in (None, line.group) and query.verdict in (None, line.verdict)
     ]
+    if query.search:
+        text = query.search.casefold()
+        found = _asset_rows(context.store, wanted)
+        rows = [row for row in found if text in f"{row.asset} {row.group} {row.summary}".casefold()]
+        total, rows = len(rows), query.page(rows)
+    else:
+        total, rows = len(wanted), _asset_rows(context.store, query.page(wanted))
     return schemas.FleetStatus(
         now=time.time(),
         configured=len(context.config.assets) if context.config is not None else 0,
-        assets=sorted(wanted, key=lambda row: (-row.severity, row.asset)),
-        groups=sorted({row.group for row in rows if row.group}),
+        total=total,
+        mark=mark,
+        assets=rows,
+        groups=sorted({line.group for line in lines if line.group}),
         services=[
             schemas.ServiceRow.from_status(status_entry.name, status)
-            for status_entry, status in service_statuses(statuses)
+            for status_entry, status in service_statuses(services.values())
         ],
     )
+
+
+def _asset_rows(store: Store, names: list[str]) -> list[schemas.AssetRow]:
+    stored = asset_statuses(read_statuses(store, names).values())
+    rows = [schemas.AssetRow.from_status(entry.name, entry.at, status) for entry, status in stored]
+    return sorted(rows, key=lambda row: (-row.severity, row.asset))
 
 
 @router.get("/assets/{asset}")

@@ -15,7 +15,7 @@ from servoscope.web.dependencies import VIEWER, Context, ContextDep
 from servoscope.web.event_hub import format_sse
 from servoscope.web.middleware import authenticate
 from servoscope.web.routes.assets import build_asset_detail, find_asset
-from servoscope.web.schemas.requests import AssetQuery
+from servoscope.web.schemas.requests import LiveQuery
 
 router = APIRouter(tags=["live"], dependencies=[VIEWER])
 
@@ -29,28 +29,33 @@ RETRY = b"retry: 2000\n\n"
     responses={200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}, "description": "Events"}},
 )
 async def stream_events(
-    context: ContextDep, request: Request, query: Annotated[AssetQuery, Query()]
+    context: ContextDep, request: Request, query: Annotated[LiveQuery, Query()]
 ) -> StreamingResponse:
-    """Send the fleet, or one asset, as it is, and then what changes."""
+    """Send the fleet, or one asset, as it is, and then what changes; `since` a mark, that alone."""
     if query.asset is not None:
         await asyncio.to_thread(find_asset, context, query.asset)
+
+    # a browser that connects again repeats the mark of the last event that it has
+    tick = context.event_hub.tick_at(request.headers.get("last-event-id", query.since))
 
     def is_permitted() -> bool:
         return authenticate(request.headers, context) is not None
 
     async def counted() -> AsyncIterator[bytes]:
         with request.app.state.metrics.event_readers.track_inprogress():
-            async for text in _event_stream(context, query.asset, is_permitted):
+            async for text in _event_stream(context, query.asset, tick, is_permitted):
                 yield text
 
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     return StreamingResponse(counted(), media_type="text/event-stream", headers=headers)
 
 
-async def _event_stream(context: Context, asset: str | None, is_permitted: Callable[[], bool]) -> AsyncIterator[bytes]:
-    """Yield events until the reader loses its permission, or the server stops."""
+async def _event_stream(
+    context: Context, asset: str | None, tick: int, is_permitted: Callable[[], bool]
+) -> AsyncIterator[bytes]:
+    """Yield events since a tick until the reader loses its permission, or the server stops."""
     hub = context.event_hub
-    tick, number, error = -1, hub.last_number, ""
+    number, error = hub.last_number, ""
     yield RETRY
     while not hub.closed and is_permitted():
         sent = False

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, get_args
 
@@ -14,7 +14,7 @@ from pydantic import Field
 from servoscope.estimation.frequency_response import CHI2_95_2DOF, ResponseRow
 from servoscope.prognosis.series import NORMAL_95
 from servoscope.report.document import to_json
-from servoscope.service.alarms import PRIORITIES, TRANSITION_TABLE, LifecycleEvent, LifecycleState, Ne107
+from servoscope.service.alarms import TRANSITION_TABLE, LifecycleEvent, LifecycleState
 from servoscope.service.alarms.records import UNACKNOWLEDGED_STATES
 from servoscope.service.assets.outlook import Outlook
 from servoscope.service.assets.status import AlarmStatus, AssetStatus, AssetVerdict, FloodCounts, ServiceStatus
@@ -28,11 +28,10 @@ from servoscope.web.schemas.responses import (
     NullableFloats,
     SignalColumns,
 )
+from servoscope.web.statuses import alarm_rank, severity
 from servoscope.web.stored_diagnosis import read_diagnosis, stored_headline
 
 COMMAND_NAMES: tuple[CommandName, ...] = get_args(CommandName)
-NE107_RANKS: tuple[Ne107, ...] = get_args(Ne107)
-MAX_EXCESS = 3.9  # of a statistic over its limit, in the severity: less than one step of alarm priority
 
 
 class AlarmRow(AlarmStatus, ApiResponse):
@@ -45,7 +44,7 @@ class AlarmRow(AlarmStatus, ApiResponse):
     @property
     def rank(self) -> int:
         """How urgent its priority is, from 1; 0 without one."""
-        return PRIORITIES.index(self.priority) + 1 if self.priority is not None else 0
+        return alarm_rank(self.priority)
 
     @property
     def unacknowledged(self) -> bool:
@@ -64,9 +63,10 @@ class AlarmDetail(AlarmRow):
 
 
 class AlarmList(ApiResponse):
-    """Alarms, the most urgent first."""
+    """Alarms, the most urgent first; `mark`: as in the list of assets."""
 
     now: float
+    mark: str
     alarms: list[AlarmDetail]
     flood: FloodCounts | None
 
@@ -161,7 +161,7 @@ class AssetRow(AssetVerdict, ApiResponse):
             "heard": status.reception == "followed" and "silent" not in status.quality,
             "t": status.position.t,
             "at": at,
-            "severity": _severity(status, alarms),
+            "severity": severity(status),
         }
         return cls.model_validate({**dict(status), **derived})
 
@@ -180,10 +180,16 @@ class ServiceRow(ApiResponse):
 
 
 class FleetStatus(ApiResponse):
-    """All assets, the most urgent first; `configured`: how many the service file has."""
+    """Assets, the most urgent first.
+
+    `configured`: how many the service file has; `total`: how many are like what was asked for, on all pages; `mark`:
+    what ``/live?since=`` sends the changes since.
+    """
 
     now: float
     configured: int
+    total: int
+    mark: str
     assets: list[AssetRow]
     groups: list[str]
     services: list[ServiceRow]
@@ -368,14 +374,6 @@ def relative_residual(status: AssetStatus) -> float | None:
         if real is not None and imaginary is not None and healthy
     ]
     return max(shares, default=None)
-
-
-def _severity(status: AssetStatus, alarms: Iterable[AlarmRow]) -> float:
-    """Return how urgent an asset is: a fault, then the NE 107 status, then unacknowledged alarms, then statistics."""
-    fault = 100.0 if status.verdict == "fault" else 0.0
-    waiting = max((alarm.rank for alarm in alarms if alarm.unacknowledged), default=0)
-    excess = min(max(status.statistic or 0.0, status.level or 0.0), MAX_EXCESS)
-    return fault + 20.0 * NE107_RANKS.index(status.ne107) + 4.0 * waiting + round(excess, 3)
 
 
 def signal_units(units: Sequence[str]) -> dict[str, str] | None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from servoscope.baseline.records import Occasion
 from servoscope.core.verdict import VerdictKind
 
+T = TypeVar("T")
 Text = Annotated[str, Field(max_length=1000)]
 Id = Annotated[str, Field(min_length=1, max_length=150)]
 UtcSeconds = Annotated[float, Field(allow_inf_nan=False, ge=-1e11, le=1e11)]  # [UTC s]
@@ -53,12 +54,24 @@ class AssetQuery(ApiRequest):
         return [self.asset] if self.asset is not None else []
 
 
+class LiveQuery(AssetQuery):
+    """An asset, or all of them; `since`: the mark of what is known already, else all are sent first."""
+
+    since: Annotated[str, Field(max_length=100)] = ""
+
+
 class FleetQuery(ApiRequest):
-    """Which assets to list."""
+    """Which assets to list, and which page of them; without `limit` all."""
 
     search: Text = ""
     group: Text | None = None
     verdict: VerdictKind | None = None
+    limit: Annotated[int, Field(ge=1, le=1000)] | None = None
+    offset: Annotated[int, Field(ge=0, le=10**9)] = 0
+
+    def page(self, rows: list[T]) -> list[T]:
+        """Return the rows of the page."""
+        return rows[self.offset :][: self.limit]
 
 
 class TimeQuery(ApiRequest):
