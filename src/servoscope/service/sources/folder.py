@@ -272,7 +272,7 @@ class FolderTransport(ThreadTransport):
         key = file.name, file.version
         if key not in self._first_times:
             self._asked_at, loop = time.monotonic(), self._assets[file.asset or next(iter(self._assets))].loop
-            self._first_times[key] = find_first_time(self._folder / file.name, file, loop)
+            self._first_times[key] = find_first_time(self._folder, file, loop)
         return self._first_times[key], file.name
 
     def _read(self, file: LogFile) -> None:

@@ -17,6 +17,7 @@ from servoscope.core.errors import ConfigError, RecordingError, ServoscopeError
 from servoscope.core.settings import NonEmptyStr
 from servoscope.models.loop import Loop
 from servoscope.service.sources.settings import SourceSettings
+from servoscope.signals.readers.reader_process import read_restricted
 from servoscope.signals.readers.recording_file import first_time, read_log
 from servoscope.signals.samples import Samples
 
@@ -121,7 +122,8 @@ def parse_file(
     assets = [file.asset] if file.asset else list(loop_of)
     loops = {loop_of[name].hash(): loop_of[name] for name in assets}
     for key, loop in loops.items():
-        logged = read_log(path, loop, settings.asset_column)
+        with read_restricted(folder):
+            logged = read_log(path, loop, settings.asset_column)
         for called, part in logged.parts.items():
             name = file.asset or names.assets.get(called, "")
             if not name or loop_of[name].hash() != key:
@@ -150,10 +152,11 @@ def _named_time(text: str, loop: Loop) -> float | None:
         return None
 
 
-def find_first_time(path: Path, file: LogFile, loop: Loop) -> float:
+def find_first_time(folder: Path, file: LogFile, loop: Loop) -> float:
     """Return the time of the first row [UTC s], as the file, its name or its date says."""
     try:
-        first = first_time(path, loop)
+        with read_restricted(folder):
+            first = first_time(folder / file.name, loop)
     except Exception:  # why it cannot be read is told when it is its turn
         first = math.nan
     return first if first >= MIN_EPOCH_S else _named_time(file.time, loop) or file.modified_at

@@ -17,7 +17,13 @@ from typing import IO, TypeVar
 from servoscope.core.errors import RecordingError
 from servoscope.core.temporary import temporary_folder
 from servoscope.signals.readers.addresses import is_address
-from servoscope.signals.readers.table import Table, TableFile, shorten_error
+from servoscope.signals.readers.table import (
+    MAX_UNPACKED_RATIO,
+    MIN_UNPACKED_LIMIT_BYTES,
+    Table,
+    TableFile,
+    shorten_error,
+)
 
 _T = TypeVar("_T")
 
@@ -27,8 +33,6 @@ ACCOMPANYING_FILES = re.compile(
     r"(?:^|/)(?:read\W?me|lies\W?mich|lisez\W?moi|licen[cs]e|notes?)\b[^/]*$|\.(?:md|pdf|rtf|docx?|png|jpe?g)$", re.I
 )
 MAX_UNPACKED_BYTES = 8_000_000_000  # of one file when it is unpacked
-MAX_UNPACKED_RATIO = 200  # times its size in the archive; measured values shrink to a tenth
-MIN_UNPACKED_LIMIT_BYTES = 100_000_000  # that any file may have when it is unpacked
 
 
 def expand_paths(paths: Sequence[Path], suffixes: Collection[str], what: str = "recordings") -> list[Path]:

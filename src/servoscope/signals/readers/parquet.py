@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.table import CHUNK_ROWS, Table, TableFile, check_width, one_line_errors
+from servoscope.signals.readers.table import CHUNK_ROWS, Table, TableFile, check_size, check_width, one_line_errors
 
 SAMPLE_ROWS = 100  # that say how many values the cells of a column hold
 BUFFER_BYTES = 1 << 20  # of each column
@@ -28,10 +28,13 @@ def open_parquet(path: Path) -> TableFile:
         first = 1
         # neither read_table nor a memory map: the one imports pandas, the other takes the file for memory
         with one_line_errors(*damaged), pq.ParquetFile(path, buffer_size=BUFFER_BYTES, pre_buffer=False) as file:
+            about = file.metadata  # whose own number of rows may be another one
+            rows = sum(about.row_group(k).num_rows for k in range(about.num_row_groups))
+            check_size(path, rows, len(wanted))
             for batch in file.iter_batches(CHUNK_ROWS, columns=[*dict.fromkeys(places[name] for name in wanted)]):
                 nested = _flatten(batch) if any(places[name] != name for name in wanted) else {}
                 columns = {n: nested[n] if n in nested else pa.chunked_array([batch.column(n)]) for n in wanted}
-                share = (first - 1 + batch.num_rows) / file.metadata.num_rows
+                share = (first - 1 + batch.num_rows) / rows if rows > 0 else 1.0
                 yield Table(path.name, columns, first, share=share)
                 first += batch.num_rows
 

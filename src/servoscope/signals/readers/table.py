@@ -22,6 +22,9 @@ NULL_TEXTS = (
     "1.#QNAN",
 )
 SAMPLE_TOGETHER = "--resample (resample = true in [columns]) puts them on one clock"
+NUMBER_BYTES = 8
+MAX_UNPACKED_RATIO = 200  # times its size, that a file may have when it is unpacked; measured values shrink to a tenth
+MIN_UNPACKED_LIMIT_BYTES = 100_000_000  # that any file may have when it is unpacked
 CHUNK_ROWS = 1 << 16  # that are read at a time
 MAX_COLUMNS = 20_000  # of a file: beyond that the description of the columns is what fills the memory
 TIME_UNITS_BY_NAME = {"millitm": "ms", "msec": "ms", "ms": "ms", "milliseconds": "ms"}  # beside a time of day
@@ -53,6 +56,16 @@ def check_width(path: Path, count: int) -> None:
     """Refuse a file with too many columns; raises RecordingError."""
     if count > MAX_COLUMNS:
         raise RecordingError(f"{path}: has {count} columns, more than {MAX_COLUMNS}: leave out what is not needed")
+
+
+def check_size(path: Path, rows: int, columns: int) -> None:
+    """Refuse a file whose numbers would need improbably more memory than the file itself; raises RecordingError."""
+    most = max(MIN_UNPACKED_LIMIT_BYTES, MAX_UNPACKED_RATIO * path.stat().st_size)
+    if (size := NUMBER_BYTES * rows * columns) > most:
+        raise RecordingError(
+            f"{path}: claims {rows} rows of {columns} columns, {size / 1e6:.0f} MB, and a file of its size"
+            f" has at most {most / 1e6:.0f} MB: write it in parts"
+        )
 
 
 def number_column(table: Table, name: str, what: str) -> FloatArray:
@@ -297,6 +310,12 @@ class Part:
 
 
 _part: ContextVar[Part | None] = ContextVar("part", default=None)
+
+
+def rows_wanted() -> int | None:
+    """Return about how many rows of a file are wanted, in this thread; None: all."""
+    part = _part.get()
+    return None if part is None else part.rows
 
 
 @contextmanager
