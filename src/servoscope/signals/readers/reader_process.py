@@ -62,14 +62,14 @@ def is_restricted() -> bool:
     return _folder.get() is not None
 
 
-def open_bounded(path: Path, kind: str, module: str, function: str, library: str, *more: Any) -> TableFile:
+def open_bounded(path: Path, kind: str, module: str, function: str, library: str, *layout: Any) -> TableFile:
     """Open a file in a worker, which can open no other one, or those of the folder that is being read.
 
-    `kind`: what errors call the file; `module`, `function`: what opens it, with `library`, given the path and `more`.
+    `kind`: what errors call the file; `module`, `function`: what opens it, with `library`, given the path and `layout`.
     Raises RecordingError if it cannot be read, also where it would take more time or memory than files of its size do.
     """
     timeout_s = BASE_S + path.stat().st_size / BYTES_PER_S
-    place = (module, function, str(path.absolute()), str(path), more)
+    place = (module, function, str(path.absolute()), str(path), layout)
     folder, sandbox = _sandbox(path)
     target = Path(folder.name) / f"rows-{uuid4().hex}.arrow"
 
@@ -130,11 +130,11 @@ def _read_table(name: str, batch: Any, metadata: Any) -> Table:
 
 
 def describe_file(
-    _: Progress, module: str, function: str, path: str, shown: str, more: tuple[Any, ...]
+    _: Progress, module: str, function: str, path: str, shown: str, layout: tuple[Any, ...]
 ) -> dict[str, Any]:
     """Open a file, and return what columns it has, or why it cannot be read; in the worker."""
     try:
-        opened = _open(module, function, path, more)
+        opened = _open(module, function, path, layout)
     except RecordingError as error:
         return _describe_error(error, path, shown)
     described = {"columns": opened.columns, "others": opened.non_channels, "groups": opened.channel_groups}
@@ -151,7 +151,7 @@ def extract_rows(
     function: str,
     path: str,
     shown: str,
-    more: tuple[Any, ...],
+    layout: tuple[Any, ...],
     wanted: list[str],
     texts: list[str],
     most: int | None,
@@ -167,7 +167,7 @@ def extract_rows(
     writer, schema, rows = None, None, 0
     with pa.OSFile(target, "wb") as sink:
         try:
-            for table in _open(module, function, path, more).tables(wanted, texts):
+            for table in _open(module, function, path, layout).tables(wanted, texts):
                 frame = pa.table(table.columns).combine_chunks()
                 for batch in frame.to_batches() or [pa.RecordBatch.from_pylist([], frame.schema)]:
                     if writer is None or batch.schema != schema:
@@ -188,14 +188,14 @@ def extract_rows(
     return {}
 
 
-def _open(module: str, function: str, path: str, more: tuple[Any, ...]) -> TableFile:
+def _open(module: str, function: str, path: str, layout: tuple[Any, ...]) -> TableFile:
     silent = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):  # libraries print what they know of a damaged file; answers have a stream of their own
         os.dup2(silent, stream)
     os.close(silent)
     about = Path(path).stat()
-    key = path, about.st_mtime_ns, about.st_size, str(more)
+    key = path, about.st_mtime_ns, about.st_size, str(layout)
     if key not in _opened:
         _opened.clear()
-        _opened[key] = attrgetter(function)(importlib.import_module(module))(Path(path), *more)
+        _opened[key] = attrgetter(function)(importlib.import_module(module))(Path(path), *layout)
     return _opened[key]

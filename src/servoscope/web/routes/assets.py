@@ -83,8 +83,8 @@ def list_assets(context: ContextDep, query: Annotated[FleetQuery, Query()]) -> s
     ]
     if query.search:
         text = query.search.casefold()
-        found = _asset_rows(context.store, wanted)
-        rows = [row for row in found if text in f"{row.asset} {row.group} {row.summary}".casefold()]
+        listed = _asset_rows(context.store, wanted)
+        rows = [row for row in listed if text in f"{row.asset} {row.group} {row.summary}".casefold()]
         total, rows = len(rows), query.page(rows)
     else:
         total, rows = len(wanted), _asset_rows(context.store, query.page(wanted))
