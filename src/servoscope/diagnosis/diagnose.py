@@ -42,10 +42,11 @@ from servoscope.diagnosis.result import (
     recording_facts,
 )
 from servoscope.diagnosis.signal_check import (
-    describe_correction,
+    find_wrong_signals,
     judge_both_sides,
     leave_undetermined,
     limit_to_sound_part,
+    with_correction,
 )
 from servoscope.diagnosis.timeline import trace_timeline
 from servoscope.diagnosis.warnings import (
@@ -176,7 +177,8 @@ def _diagnose_at_point(
     if largest > MAX_SIGNAL:
         raise RecordingError(f"{recording.name}: has values up to {largest:.2g}, check the units of r, u and y")
     try:
-        return _judge_sound_part(baseline, recording, progress, point, before)
+        with np.errstate(over="ignore", invalid="ignore"):  # what is beyond all numbers explains nothing
+            return _judge_sound_part(baseline, recording, progress, point, before)
     except (np.linalg.LinAlgError, SimulationError, ArithmeticError) as error:
         reason = f"its numbers have no solution ({error})"
         raise RecordingError(f"{recording.name}: {reason}; check units, signs and sizes of r, u and y") from None
@@ -195,7 +197,12 @@ def _judge_sound_part(
 
 
 def _judge_signals(
-    baseline: Baseline, recording: Recording, progress: Progress, point: str | None, before: VerdictKind
+    baseline: Baseline,
+    recording: Recording,
+    progress: Progress,
+    point: str | None,
+    before: VerdictKind,
+    corrected: bool = False,
 ) -> tuple[Diagnosis, Examination, BiasCorrection | None]:
     points = baseline.per_point if point is None else (baseline.at(point),)
     recording, departed = check_sensors(points[0], recording)
@@ -217,8 +224,12 @@ def _judge_signals(
         diagnosis, correction = diagnose_examination(rivals[0], progress)
         return _with_warnings(diagnosis, sensors), rivals[0], correction
     progress("signals")
-    if (reason := describe_correction(points, recording)) is not None:
-        return leave_undetermined(rivals[0], reason), rivals[0], None
+    if not corrected and (wrong := find_wrong_signals(points, recording)) is not None:
+        correction_of_signals, is_healthy = wrong
+        if is_healthy:
+            return leave_undetermined(rivals[0], correction_of_signals.description), rivals[0], None
+        right = correction_of_signals.apply(recording)
+        return with_correction(_judge_signals(baseline, right, progress, point, before, True), correction_of_signals)
     noise = find_louder_noise(recording, baseline.loop.monitor.memory) if baseline.axis is None else None
     if noise is not None:
         return judge_both_sides(recording, noise, lambda side: _judge_signals(baseline, side, progress, point, before))

@@ -14,23 +14,36 @@ from servoscope.diagnosis.explanation import undetermined_headline
 from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, recording_facts
 from servoscope.diagnosis.warnings import warning_throughout
 from servoscope.evidence.examination import Examination
-from servoscope.evidence.signals import SignalDefect, begins_wrong, find_corrections
+from servoscope.evidence.signals import Correction, SignalDefect, begins_wrong, find_corrections, shrinks_misfit
 from servoscope.signals import Recording
 
 # a diagnosis, and what its trace is made of
 Judgement = tuple[Diagnosis, Examination, BiasCorrection | None]
 
 
-def describe_correction(points: Sequence[Baseline], recording: Recording) -> Message | None:
-    """Return what makes a recording healthy when its signals are put right; None where nothing does."""
-    first, theta = points[0], np.array(points[0].theta)
-    for correction in find_corrections(first.pipeline(), theta, first.recursion.R, recording):
-        if not begins_wrong(first.pipeline(), theta, recording, correction):
+def find_wrong_signals(points: Sequence[Baseline], recording: Recording) -> tuple[Correction, bool] | None:
+    """Return how to put the signals of a recording right, and whether it is healthy then; None where nothing does.
+
+    A unit or sign may be wrong in the recording of a fault, too.
+    """
+    first, theta, believed = points[0], np.array(points[0].theta), None
+    pipeline = first.pipeline()
+    for correction in find_corrections(pipeline, theta, first.recursion.R, recording):
+        if not begins_wrong(pipeline, theta, recording, correction):
             continue
         corrected = correction.apply(recording)
         if any(not Examination.from_recording(point, corrected).apparent_alarm.any() for point in points):
-            return correction.description
-    return None
+            return correction, True
+        if believed is None and shrinks_misfit(pipeline, theta, recording, correction):
+            believed = correction
+    return None if believed is None else (believed, False)
+
+
+def with_correction(judgement: Judgement, correction: Correction) -> Judgement:
+    """Return the judgement of a recording whose signals were put right, which it says."""
+    diagnosis, exam, bias = judgement
+    warning = warning_throughout(exam, "signals", correction.description)
+    return diagnosis.model_copy(update={"warnings": (warning, *diagnosis.warnings)}), exam, bias
 
 
 def leave_undetermined(exam: Examination, reason: Message) -> Diagnosis:

@@ -22,11 +22,15 @@ SIGNALS = ("r", "u", "y")
 _RATIOS = (*(10.0**k for k in range(1, 7)), 25.4, 180.0 / np.pi, 2.0 * np.pi, 60.0)
 FACTORS = (*_RATIOS, *(1.0 / ratio for ratio in _RATIOS))
 MIN_RESIDUAL_RATIO = 5.0  # times smaller is the residual of the healthy plant where the signals are put right
+MIN_BELIEVED_RATIO = 10.0  # the same where the plant has a fault beside
+QUIETEST_SHARE = 0.01  # of the healthy residual, below which no signals that were put right leave
 # the same where that residual is the healthy one, and up to how many times that it counts as such
 HEALTHY_RESIDUAL_RATIO = 2.0
 FROZEN_S = 1.0  # how long y or u stays exactly the same while the motion demands a change [s],
 MIN_FROZEN_SAMPLES = 10  # or, where that is longer, so many samples: a loop of 0.1 Hz answers a step after one or two
 TRAVEL_SHARE = 0.1  # of the range of y, that r moves by then
+MIN_HELD_SHARE = 0.1  # of the samples, in which u changes where a controller sets it: else it is a staircase
+FORCE_SHARE = 0.3  # of the range of u, that static friction may hold
 UNASKED_SHARE = 0.5  # of a motion, that r - y moves too where y does not follow r
 SILENCE_SHARE = 1e-6  # of the largest u: what a resampling filter leaves of 0
 JUMP_SHARE = 0.4  # of the range of y, in one sample: a counter that wraps or is reset
@@ -134,7 +138,9 @@ def find_corrections(
         return _residual_share(pipeline, theta, correction.apply(rows))
 
     share, _ = residual(Correction())
-    tried = {correction: residual(correction) for correction in _single_corrections()}
+    exchanged = Correction(order=(2, 1, 0))  # a load makes y lag r more, and r is then explained better than y
+    single = (correction for correction in _single_corrections() if correction != exchanged or not _lags(rows))
+    tried = {correction: residual(correction) for correction in single}
     best, left = min(tried.values(), default=(np.inf, np.inf))
     explained = residual_power is not None and left < HEALTHY_RESIDUAL_RATIO * residual_power
     if not best * (HEALTHY_RESIDUAL_RATIO if explained else MIN_RESIDUAL_RATIO) < share:
@@ -142,6 +148,8 @@ def find_corrections(
         return
     near = [correction for correction, (power, _) in tried.items() if power < 2.5 * best]
     if residual_power:
+        # noise does not get smaller: signals that are scaled down leave less than healthy ones, and show no fault
+        near = [correction for correction in near if QUIETEST_SHARE * residual_power < tried[correction][1]] or near
         near.sort(key=lambda similar: abs(np.log(max(tried[similar][1], 1e-300) / residual_power)))
     spreads = float(np.std(rows.r)), float(np.std(rows.y))
     opposed = min(spreads) > 0.0 and float(np.corrcoef(rows.r, rows.y)[0, 1]) < 0.0
@@ -168,6 +176,13 @@ def begins_wrong(pipeline: Pipeline, theta: FloatArray, recording: Recording, co
     return after * HEALTHY_RESIDUAL_RATIO < before
 
 
+def shrinks_misfit(pipeline: Pipeline, theta: FloatArray, recording: Recording, correction: Correction) -> bool:
+    """Return whether a factor on a signal leaves so much less unexplained that no fault needs to be away."""
+    rows = _beginning(pipeline, recording)
+    before, after = (_residual_share(pipeline, theta, signals)[0] for signals in (rows, correction.apply(rows)))
+    return correction.order == (0, 1, 2) and after * MIN_BELIEVED_RATIO < before
+
+
 def describe_misfit(pipeline: Pipeline, theta: FloatArray, recording: Recording) -> Message | None:
     """Return what is wrong with signals that the plant with theta explains only when they are put right.
 
@@ -186,6 +201,12 @@ def describe_misfit(pipeline: Pipeline, theta: FloatArray, recording: Recording)
     if of_u and of_y and of_y[0].factors[0] != 1.0:  # r agrees with y, so that both or u may be wrong
         return message("signals.unit_of_either", u=of_u[0].factors[1], y=of_y[0].factors[2])
     return (of_y or corrections)[0].description if corrections else None
+
+
+def _lags(rows: Recording) -> bool:
+    """Return whether y comes after r: by the way round in which both go through their plane."""
+    r, y = rows.r - rows.r.mean(), rows.y - rows.y.mean()
+    return float(((r[:-1] * y[1:] - y[:-1] * r[1:]) * ~rows.restart[1:]).sum()) > 0.0
 
 
 def _beginning(pipeline: Pipeline, recording: Recording) -> Recording:
@@ -242,25 +263,40 @@ def _frozen_defect(recording: Recording, finding: QualityFinding, late: int) -> 
     begin = at
     while begin and x[begin - 1] == x[at]:
         begin -= 1
+    moved = np.flatnonzero(x[begin:] != x[begin])
+    stretch = slice(begin, begin + int(moved[0]) if len(moved) else recording.samples)
     low, high = outofcore.extremes(x)
-    if name == "u" and not low < x[at] < high:
-        return None  # it is limited
-    if name == "y" and _follows_late(recording, begin, late):
+    if name == "u" and (not low < x[at] < high or _is_set_by_hand(recording, stretch)):
+        return None  # it is limited, or has no reason to change
+    if name == "y" and (_follows_late(recording, stretch, late) or _is_held(recording, stretch)):
         return None
     other = "r" if name == "y" else "r - y"
     text = message("signals.frozen", name=name, t=float(recording.t[begin]), other=other, by=finding.value)
     return SignalDefect(begin, text)
 
 
-def _follows_late(recording: Recording, begin: int, late: int) -> bool:
-    """Return whether y, at rest from a sample on, moves within some samples of the motion of r that should move it.
+def _is_set_by_hand(recording: Recording, stretch: slice) -> bool:
+    """Return whether no controller sets u: no reference is logged, or u is a staircase outside of a stretch, too."""
+    r, u = recording.r, recording.u
+    if np.ptp(outofcore.extremes(r)) == 0.0 or np.array_equal(r, u):
+        return True
+    rows = outofcore.iter_chunks(0, recording.samples, u)
+    changes = sum(int(np.count_nonzero(np.diff(u[chunk]))) for chunk in rows)
+    return changes < MIN_HELD_SHARE * (recording.samples - (stretch.stop - stretch.start))
+
+
+def _is_held(recording: Recording, stretch: slice) -> bool:
+    """Return whether friction may hold y in a stretch, u hardly changing: a weak drive rests at its turning point."""
+    return float(np.ptp(recording.u[stretch])) < FORCE_SHARE * float(np.ptp(outofcore.extremes(recording.u)))
+
+
+def _follows_late(recording: Recording, stretch: slice, late: int) -> bool:
+    """Return whether y, at rest in a stretch, moves within some samples of the motion of r that should move it.
 
     A rest before the command says nothing of the sensor, and a loop may take a while to break away.
     """
     travel = TRAVEL_SHARE * float(np.ptp(outofcore.extremes(recording.y)))
-    moved = np.flatnonzero(recording.y[begin:] != recording.y[begin])
-    end = begin + int(moved[0]) if len(moved) else recording.samples
-    r = recording.r[begin:end]
+    r = recording.r[stretch]
     demanded = np.maximum.accumulate(r) - np.minimum.accumulate(r) > travel
     return bool(demanded.any()) and len(r) - int(np.argmax(demanded)) <= late
 
@@ -276,6 +312,9 @@ def _find_jump(rows: Recording, first: int, lead: int) -> SignalDefect | None:
     if not len(jumps) or len(jumps) > MAX_JUMP_SHARE * len(steps):
         return None
     size, other = float(np.median(steps[jumps])), float(np.delete(steps, jumps).max(initial=0.0))
+    after, before = np.abs(rows.r[1:] - rows.y[1:]), np.abs(rows.r[1:] - rows.y[:-1])
+    if np.ptp(rows.r) > 0.0 and (after < before - 0.5 * size)[jumps].all():
+        return None  # y answers r, however late
     demanded = _largest_near(np.abs(np.diff(rows.r)), jumps, lead)
     if MIN_STEP_RATIO * max(other, demanded) > size or np.ptp(steps[jumps]) > 2.0 * other:
         return None  # a motion, or jumps of several sizes

@@ -34,6 +34,9 @@ MAX_SCATTER_ROUNDS = 30  # steps in which coefficients and their scatter agree
 FALSE_ALARMS = 1.0 / 200.0  # share of healthy recordings that change within themselves beyond a learned limit
 MIN_LOG_LIKELIHOOD_GAIN = 1.0  # of a likelihood ratio whose logarithm counts
 MIN_SAMPLES_PER_COLUMN = 10  # samples in motion
+# samples that the fit of the noise leaves per column, of those in motion up to a share: a filter that forgets rests
+# slowly would leave a handful of a y whose noise looks like them, and explain these perfectly
+MIN_NOISE_SAMPLES_PER_COLUMN, MAX_NOISE_SHARE = 30, 0.5
 DELAYS_S, LAGS_S = np.arange(0.0, 0.1, 0.01), (0.0, 0.01, 0.02, 0.04, 0.08)  # that are tried first
 MIN_DRIVE_GAIN = 50.0  # of twice the log-likelihood, for a delay and a lag
 MIN_DRIVE_S = 5e-3  # of both together: less is what the sampling or a compliant coupling does
@@ -109,13 +112,21 @@ def fit_axis_noise(problems: Sequence[AxisRegression], slow: float) -> AxisNoise
         (start[2] - 9.0, start[2] + 3.0),
     ]
 
+    fewest = [
+        min(
+            MIN_NOISE_SAMPLES_PER_COLUMN * len(problem.columns), MAX_NOISE_SHARE * problem.signals.moving(slow, 0).sum()
+        )
+        for problem in problems
+    ]
     first = 0
 
     def cost(x: FloatArray) -> float:
         nonlocal first
         total, count = 0.0, 0
-        for problem in problems:
+        for problem, least in zip(problems, fewest, strict=True):
             X, e, filter = problem.regress(AxisNoise(*np.exp(x).tolist()), slow)
+            if len(e) < least:
+                return np.inf
             left = e - X @ np.linalg.lstsq(X, e, rcond=None)[0]
             total += len(e) * float(np.log(filter.variance)) + float(left @ left)
             count += len(e)
@@ -123,6 +134,13 @@ def fit_axis_noise(problems: Sequence[AxisRegression], slow: float) -> AxisNoise
         # a filter that forgets a reversal sooner counts more innovations, which makes it no likelier
         return total * first / max(count, 1)
 
+    while np.isinf(cost(start)):  # the quieter y is, the sooner a filter forgets
+        if start[2] <= bounds[2][0]:
+            raise NotEnoughError(
+                "y is too coarse or too noisy for its speed: it seems to rest every few samples; record faster motion, "
+                "or log at a lower rate"
+            )
+        start[2] -= FIRST_STEP
     # a simplex of its own size: SciPy's is a share of the logarithms, and so depends on the unit of y
     simplex = np.vstack([start, start + FIRST_STEP * np.eye(len(start))])
     optimize_result = minimize(
@@ -296,7 +314,10 @@ def combine_fits(fits: Sequence[AxisFit], n: int) -> tuple[FloatArray, FloatArra
     """
     values = np.array([fit.coefficients[:n] for fit in fits])
     covariances = np.array([fit.covariance[:n, :n] for fit in fits])
-    stds = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    if not (variances > 0.0).all():
+        raise np.linalg.LinAlgError("the columns of a recording are alike")
+    stds = np.sqrt(variances)
     center, scatter = np.zeros(n), np.full(n, SCATTER)
     for step in range(MAX_SCATTER_ROUNDS):
         weights = np.linalg.inv(covariances + np.diag((scatter * center) ** 2))

@@ -11,9 +11,11 @@ from servoscope.core import outofcore
 from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.signals.timebase import NO_ROWS, previous_rows, time_steps
 
-MAX_WIDTH = 10  # samples
+MAX_WIDTH = 50  # samples
+MAX_PLAUSIBLE_WIDTH = 10  # samples; wider ones must be beyond everything
 MAX_NORMAL_WIDTH = 3  # samples; wider ones must be enormous
-MIN_WIDE_SPIKE_FACTOR = 10.0  # times the range of the signal
+MIN_WIDE_SPIKE_FACTOR = 10.0  # times the range of the signal,
+MIN_BEYOND_FACTOR = 1e4  # and of those that are beyond everything
 LOCAL_STEP_FACTOR = 6.0  # times the upper quartile of the local steps: about 9 standard deviations of white noise
 QUANTUM_FACTOR = 4.0  # times the median step that is not zero, so that an encoder's counts at rest are no spikes
 NEIGHBOURS = 20  # samples on either side that define what is normal
@@ -30,7 +32,7 @@ def find_spikes(
     share: float,
     excused: Callable[[IndexArray], BoolArray] = lambda rows: np.zeros(rows.size, dtype=np.bool_),
 ) -> IndexArray:
-    """Find isolated spikes of at most ten samples.
+    """Find isolated spikes of at most ten samples, and of fifty where they are ten thousand times the range.
 
     A spike rises above both of its neighbours by more than `share` of the signal's range (1 to 99 %
     quantile) and far more than the steps around it; where it is wider than three samples or stands at the
@@ -39,7 +41,7 @@ def find_spikes(
 
     `x`: signal, shape (N,), finite; `run`: index of the run of each sample, shape (N,); nothing is compared across
     runs; `share`: smallest height of a spike, as a share of the signal's range; `excused`: tells which of some
-    samples may jump, for example u where the reference steps.
+    samples may jump, for example u where the reference steps; by no more than ten times the range.
     """
     spikes = NO_ROWS
     for _ in range(PASSES):  # spikes hide others: range and neighbours are taken again without those found
@@ -99,11 +101,15 @@ def _find_spikes_once(
     for width in range(1, MAX_WIDTH + 1):
         if width > MAX_NORMAL_WIDTH and (span == 0.0 or highest <= enormous):
             break  # one that is wide is entered, or left where it stands at an edge, by an enormous step
-        smallest = modest if width <= MAX_NORMAL_WIDTH else enormous
+        if width > MAX_PLAUSIBLE_WIDTH and highest <= MIN_BEYOND_FACTOR * span:
+            break
+        wide = enormous if width <= MAX_PLAUSIBLE_WIDTH else MIN_BEYOND_FACTOR * span
+        smallest = modest if width <= MAX_NORMAL_WIDTH else wide
         start, height = _find_excursions(z, run, entered, width, smallest, enormous if span > 0.0 else np.inf)
         # The spike itself takes two steps of its surroundings; a quartile does not notice.
-        start = start[height > LOCAL_STEP_FACTOR * _local_step_quartile(z, start, np.full(start.size, width))]
-        start = start[~excused(start)]
+        high = height > LOCAL_STEP_FACTOR * _local_step_quartile(z, start, np.full(start.size, width))
+        start, height = start[high], height[high]
+        start = start[~excused(start) | ((span > 0.0) & (height > enormous))]  # no controller kicks as far as that
         if start.size:
             # narrow ones first: what lies between two of them looks like a wide one of the other sign
             return np.unique(start + np.arange(width)[:, None])

@@ -99,6 +99,7 @@ def fit_further_parameters(
 
 def _local_minima(cost: FloatArray) -> npt.NDArray[np.int64]:
     """Return where the lowest valleys of a table are, the lowest first, shape (v, cost.ndim)."""
+    cost = np.where(np.isfinite(cost), cost, np.inf)  # of a plant that cannot run, or of signals beyond all numbers
     around = np.lib.stride_tricks.sliding_window_view(np.pad(cost, 1, constant_values=np.inf), (3,) * cost.ndim)
     minima = np.argwhere(cost <= around.min(axis=tuple(range(-cost.ndim, 0))))
     return minima[np.argsort(cost[tuple(minima.T)])][:VALLEYS]
