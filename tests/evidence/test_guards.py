@@ -94,6 +94,13 @@ def test_a_controller_that_stops_within_its_log_is_stuck() -> None:
     assert find_signal_defect(replace(recording, y=resting)) is not None
 
 
+def test_learn_leaves_out_a_recording_with_a_defect_and_says_so() -> None:
+    recordings = [moved(0), replace(moved(1), u=np.where(T < 12.0, moved(1).u, moved(1).u[1200]), name="broken")]
+    learned = ss.learn(LOOP, recordings)
+    assert [source.name for source in learned.sources] == [recordings[0].name]
+    assert any("broken is left out: from 12.0 s on u stays" in str(note) for note in learned.notes)
+
+
 def test_a_counter_wraps_away_from_the_reference_at_every_rate() -> None:
     k = np.arange(600)
     r = np.where(k // 60 % 2 > 0, 1.0, -1.0)

@@ -63,6 +63,8 @@ def _growth(name: str, x: FloatArray, recording: Recording, shortest: int) -> Lo
     with np.errstate(divide="ignore"):
         cost = np.where(grown, k * np.log(before) + (N - k) * np.log(after), np.inf)
     at = int(np.argmin(cost))
+    if at in (0, len(k) - 1):
+        return None  # it began before, or after, where either side can be judged
     onset = int(k[at])
     steps, spread = np.diff(x, ORDER + 1), float(x[:onset].std())
     added = [float(np.mean(part[onset:] ** 2) - np.mean(part[:onset] ** 2)) for part in (d, steps)]
@@ -73,6 +75,21 @@ def _growth(name: str, x: FloatArray, recording: Recording, shortest: int) -> Lo
     ):
         return None
     return LouderNoise(name, onset + ORDER // 2, float(np.sqrt(after[at] / before[at])))
+
+
+def grows_innovations(pipeline: Pipeline, recording: Recording, noise: LouderNoise) -> bool:
+    """Return whether the regression leaves more of u, too, each side with coefficients of its own.
+
+    A fault that makes a signal louder, or what a loop does of it, leaves as much as before.
+    """
+    g = pipeline.regression(recording.r, recording.u, recording.y, recording.restart)
+    rows, variances = np.flatnonzero(g.ok), list[float]()
+    for side in (rows[rows < noise.last_quiet], rows[rows >= noise.onset]):
+        if len(side) <= g.phi.shape[1]:
+            return True
+        theta = np.linalg.lstsq(g.phi[side], g.eta[side], rcond=None)[0]
+        variances.append(float(np.mean((g.eta[side] - g.phi[side] @ theta) ** 2)))
+    return variances[1] > MIN_NOISE_GROWTH * variances[0]
 
 
 def noise_growth(pipeline: Pipeline, estimates: Estimates) -> float:

@@ -15,7 +15,7 @@ from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import RecordingError, SimulationError
 from servoscope.core.messages import Message, message
 from servoscope.core.verdict import FOUND, VerdictKind
-from servoscope.detection.louder_noise import find_louder_noise
+from servoscope.detection.louder_noise import find_louder_noise, grows_innovations
 from servoscope.detection.onset import Onset
 from servoscope.detection.trace import UNSEEN_EXCESS, Trace
 from servoscope.diagnosis import ml_refit
@@ -42,11 +42,10 @@ from servoscope.diagnosis.result import (
     recording_facts,
 )
 from servoscope.diagnosis.signal_check import (
-    find_wrong_signals,
     judge_both_sides,
+    judge_put_right,
     leave_undetermined,
     limit_to_sound_part,
-    with_correction,
 )
 from servoscope.diagnosis.timeline import trace_timeline
 from servoscope.diagnosis.warnings import (
@@ -197,12 +196,7 @@ def _judge_sound_part(
 
 
 def _judge_signals(
-    baseline: Baseline,
-    recording: Recording,
-    progress: Progress,
-    point: str | None,
-    before: VerdictKind,
-    corrected: bool = False,
+    baseline: Baseline, recording: Recording, progress: Progress, point: str | None, before: VerdictKind
 ) -> tuple[Diagnosis, Examination, BiasCorrection | None]:
     points = baseline.per_point if point is None else (baseline.at(point),)
     recording, departed = check_sensors(points[0], recording)
@@ -224,15 +218,12 @@ def _judge_signals(
         diagnosis, correction = diagnose_examination(rivals[0], progress)
         return _with_warnings(diagnosis, sensors), rivals[0], correction
     progress("signals")
-    if not corrected and (wrong := find_wrong_signals(points, recording)) is not None:
-        correction_of_signals, is_healthy = wrong
-        if is_healthy:
-            return leave_undetermined(rivals[0], correction_of_signals.description), rivals[0], None
-        right = correction_of_signals.apply(recording)
-        return with_correction(_judge_signals(baseline, right, progress, point, before, True), correction_of_signals)
+    again = partial(_judge_signals, baseline, progress=progress, point=point, before=before)
+    if (put_right := judge_put_right(points, recording, rivals[0], again)) is not None:
+        return put_right
     noise = find_louder_noise(recording, baseline.loop.monitor.memory) if baseline.axis is None else None
-    if noise is not None:
-        return judge_both_sides(recording, noise, lambda side: _judge_signals(baseline, side, progress, point, before))
+    if noise is not None and grows_innovations(points[0].pipeline(), recording, noise):
+        return judge_both_sides(recording, noise, again)
     diagnoses = sorted(
         ((*diagnose_examination(exam, progress, before), exam) for exam in rivals),
         key=lambda judged: (judged[0].verdict not in FOUND, _change_size(judged[0])),

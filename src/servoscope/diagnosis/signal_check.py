@@ -39,9 +39,19 @@ def find_wrong_signals(points: Sequence[Baseline], recording: Recording) -> tupl
     return None if believed is None else (believed, False)
 
 
-def with_correction(judgement: Judgement, correction: Correction) -> Judgement:
-    """Return the judgement of a recording whose signals were put right, which it says."""
-    diagnosis, exam, bias = judgement
+def judge_put_right(
+    points: Sequence[Baseline], recording: Recording, exam: Examination, judge: Callable[[Recording], Judgement]
+) -> Judgement | None:
+    """Return the judgement of a recording whose signals are wrong, which it says; None where they are not.
+
+    One that is healthy with its signals put right is undetermined; any other is judged with them.
+    """
+    if (wrong := find_wrong_signals(points, recording)) is None:
+        return None
+    correction, is_healthy = wrong
+    if is_healthy:
+        return leave_undetermined(exam, correction.description), exam, None
+    diagnosis, exam, bias = judge(correction.apply(recording))
     warning = warning_throughout(exam, "signals", correction.description)
     return diagnosis.model_copy(update={"warnings": (warning, *diagnosis.warnings)}), exam, bias
 

@@ -282,7 +282,7 @@ def _is_set_by_hand(recording: Recording, stretch: slice) -> bool:
         return True
     rows = outofcore.iter_chunks(0, recording.samples, u)
     changes = sum(int(np.count_nonzero(np.diff(u[chunk]))) for chunk in rows)
-    return changes < MIN_HELD_SHARE * (recording.samples - (stretch.stop - stretch.start))
+    return bool(changes < MIN_HELD_SHARE * (recording.samples - (stretch.stop - stretch.start)))
 
 
 def _is_held(recording: Recording, stretch: slice) -> bool:

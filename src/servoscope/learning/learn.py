@@ -33,6 +33,7 @@ from servoscope.learning.recursion import (
     check_signals,
     describe_recursion,
     form_healthy_recordings,
+    leave_out_defects,
     tune_pipeline,
 )
 from servoscope.learning.scatter import follow_recordings, learn_scatter, learn_thresholds, widen_scatter
@@ -72,6 +73,7 @@ def learn_baseline(
     if not recordings:
         raise NotEnoughError("no recording to learn from: give at least one healthy recording")
     progress("regressors")
+    recordings, left_out = leave_out_defects(loop, recordings)
     for rec in recordings:
         check_signals(loop, rec)
     if loop.columns.covariates or loop.monitor.hidden_warm_up:
@@ -87,7 +89,7 @@ def learn_baseline(
     ]
     doubts = [doubt for rec in recordings if (doubt := doubt_healthy(rec)) is not None]
     off = [defect.description for defect in map(find_switched_off, healthy.recordings) if defect is not None]
-    healthy = replace(healthy, notes=[*healthy.notes, *simplified, *notes, *doubts, *off])
+    healthy = replace(healthy, notes=[*left_out, *healthy.notes, *simplified, *notes, *doubts, *off])
     progress("healthy parameters")
     try:
         return _assemble_baseline(healthy, learn_plant(healthy), delay_s, progress, earlier)

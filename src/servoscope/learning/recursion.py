@@ -31,10 +31,22 @@ REST_SPEED_SHARE = 0.02  # of the speed of motion, below which an axis stands st
 MIN_INSTRUMENT_EIGENVALUE = 0.05  # below, the instrument says too little of the regressor to be worth its variance
 
 
-def check_signals(loop: Loop, recording: Recording) -> None:
-    """Refuse a recording with stuck, wrapped or exchanged signals, of another sign or unit, or with u at its limits."""
-    if (defect := find_signal_defect(recording, loop.delay)) is not None:
+def leave_out_defects(loop: Loop, recordings: Sequence[Recording]) -> tuple[list[Recording], list[Message]]:
+    """Return the recordings in which no signal is stuck or wraps, and a note for each of the others.
+
+    Raises RecordingError where all have such a defect.
+    """
+    defects = [find_signal_defect(recording, loop.delay) for recording in recordings]
+    known = [(rec, defect) for rec, defect in zip(recordings, defects, strict=True) if defect is not None]
+    if len(known) == len(recordings):
+        recording, defect = known[0]
         raise RecordingError(f"{recording.name}: {defect.description}; or leave that part out")
+    notes = [message("learning.defect", recording=rec.name, reason=defect.description) for rec, defect in known]
+    return [rec for rec, defect in zip(recordings, defects, strict=True) if defect is None], notes
+
+
+def check_signals(loop: Loop, recording: Recording) -> None:
+    """Refuse a recording with exchanged signals, of another sign or unit, or with u at its limits."""
     if loop.plant.has_physics:
         plain = loop.model_copy(update={"monitor": loop.monitor.model_copy(update={"two_stage": "none"})})
         misfit = describe_misfit(Pipeline.of(plain), nominal_theta(loop), recording)
