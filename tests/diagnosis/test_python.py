@@ -109,6 +109,23 @@ def test_a_log_leads_to_a_loop_file(tmp_path: Path) -> None:
     assert ss.Loop.load(tmp_path / "loop.toml").columns.input == "cur"
 
 
+def test_frames_and_arrays_go_from_a_log_to_a_baseline() -> None:
+    loop = ss.Loop.load(RIG)
+    frame = simulate(loop, reference("multisine", 20.0, loop.sample_rate), seed=1)[0].to_frame().drop(columns="run")
+    proposed = ss.init(frame)
+    arrays = {name: column.to_numpy() for name, column in frame.items()}
+    assert ss.init(arrays).loop.plant == proposed.loop.plant
+
+    class Lazy:
+        def collect(self) -> object:
+            return frame
+
+    one, lazy = ss.learn(proposed.loop, frame), ss.learn(proposed.loop, Lazy())
+    assert one.theta == lazy.theta == ss.learn(proposed.loop, [arrays]).theta
+    assert one.to_frame()["coefficient"].tolist() == list(one.names)
+    assert one.to_frame()["value"].tolist() == list(one.theta) and (one.to_frame()["std"] > 0.0).all()
+
+
 def test_a_name_cannot_put_markup_into_a_notebook(tmp_path: Path) -> None:
     found = ss.read(written(tmp_path, lines(), "a&b.csv"))
     assert "a&amp;b.csv" in found._repr_html_() and "a&b" in repr(found)

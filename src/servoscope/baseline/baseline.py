@@ -40,6 +40,7 @@ from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.estimation.pipeline import Pipeline, Tuning
 from servoscope.models.loop import Loop
 from servoscope.models.plants import Plant
+from servoscope.signals.recording import frame_of
 
 FORMAT = "servoscope-baseline"
 ARM_FORMAT = "servoscope-arm-baseline"  # what `ArmBaseline` writes
@@ -297,6 +298,25 @@ class Baseline(ShortRepr, LearnedEvidence):
     def settled_after(self) -> float:
         """Updates after which the recursion has forgotten its start."""
         return SETTLED_MEMORIES * self.pipeline().memory
+
+    def to_frame(self) -> Any:
+        """Return the healthy coefficients as a frame of pandas, a row for each with its standard deviation.
+
+        Raises RecordingError if pandas is missing.
+
+        Examples
+        --------
+        >>> ss.Baseline.load("baseline.json").to_frame()["coefficient"].tolist()
+        ['viscous_friction', 'inertia', 'coulomb_friction', 'offset']
+        """
+        rows = [
+            {"point": each.point, "coefficient": name, "value": value, "std": std}
+            for each in self.per_point
+            for name, value, std in zip(
+                each.names, each.theta, np.sqrt(np.diag(each.covariance_array())).tolist(), strict=True
+            )
+        ]
+        return frame_of("baseline", rows)
 
     def save(self, path: str | Path) -> None:
         """Write the baseline as JSON; nothing half-written stays behind.

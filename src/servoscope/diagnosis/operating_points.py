@@ -24,7 +24,7 @@ from servoscope.learning.plausibility import check_plausibility, check_wraps
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 from servoscope.signals.readers import as_recording
-from servoscope.signals.readers.frames import Source
+from servoscope.signals.readers.frames import Frame, Source, is_frame
 from servoscope.signals.recording import thin_out
 
 MAX_SAMPLES = 250_000  # of all recordings, that are learned from: more take memory and time, and show little more
@@ -34,7 +34,12 @@ MIN_PROBABILITY_NOTED = 0.05  # probability from which a fault is noted that loo
 
 def learn(
     loop: Loop | str | Path,
-    recordings: Recording | str | Path | Sequence[Recording | Source] | Mapping[str, Sequence[Recording | Source]],
+    recordings: Recording
+    | str
+    | Path
+    | Frame
+    | Sequence[Recording | Source]
+    | Mapping[str, Sequence[Recording | Source]],
     progress: Progress = lambda _: None,
     *,
     compare: Baseline | None = None,
@@ -107,7 +112,7 @@ def learn(
     >>> baseline.save("baseline.json")
     """
     loop = Loop.of(loop)
-    if isinstance(recordings, str | Path | Recording):
+    if isinstance(recordings, str | Path | Recording) or is_frame(recordings):
         recordings = [recordings]
     given = recordings if isinstance(recordings, Mapping) else {"": recordings}
     named = {name: [as_recording(source, loop) for source in some] for name, some in given.items()}

@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from pydantic import ValidationError
@@ -33,6 +34,7 @@ from servoscope.signals.readers import ChannelInfo, list_channels, read
 from servoscope.signals.readers.axes import axes_of, own_clock, signal_names, signals_of_one_axis
 from servoscope.signals.readers.columns import LinearCombination, header_hint, parse_combination, parse_fields
 from servoscope.signals.readers.formats import open_file
+from servoscope.signals.readers.frames import Source, is_frame, write_source
 from servoscope.signals.readers.guess_columns import (
     FIELDS,
     guess_mapping,
@@ -268,7 +270,7 @@ def _further_columns(
 
 
 def init(
-    path: str | Path | Sequence[str | Path],
+    path: Source | Sequence[Source],
     columns: Columns | str | None = None,
     *,
     where: Mapping[str, str] | None = None,
@@ -279,7 +281,7 @@ def init(
     Parameters
     ----------
     path
-        The log, or several of one machine.
+        The log, or several of one machine: paths, frames, or arrays by name.
     columns
         The columns, or what is known of them, as ``"u=cur"``: the others are guessed by the words and units in their
         names.
@@ -301,8 +303,13 @@ def init(
     >>> ss.init("monday.csv").loop.sample_rate
     200.0
     """
-    paths = [Path(path)] if isinstance(path, str | Path) else [Path(log) for log in path]
-    with read_part(PART_ROWS) as part:
+    sources = [path] if isinstance(path, str | Path | Mapping) or is_frame(path) else [*path]
+    with read_part(PART_ROWS) as part, TemporaryDirectory() as folder:
+        paths = []
+        for k, log in enumerate(sources):
+            own = Path(folder) / str(k)
+            own.mkdir()
+            paths.append(Path(log) if isinstance(log, str | Path) else write_source(log, own))
         if not isinstance(columns, Columns):
             columns = propose_columns(paths[0], list_channels(paths[0]), given=columns)
         proposal = propose_loop(paths, columns, where, kind=kind)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,9 @@ from servoscope.models.loop import TextLayout
 from servoscope.signals.readers.formats import open_file
 from servoscope.signals.readers.table import TableFile, one_line_errors
 
+if TYPE_CHECKING:
+    from typing_extensions import TypeIs
+
 
 class ArrowStream(Protocol):
     """A frame that hands its columns over by Arrow's protocol, as those of pandas and polars do."""
@@ -22,7 +25,20 @@ class ArrowStream(Protocol):
         """Return a capsule of Arrow."""
 
 
-Source = str | Path | Mapping[str, npt.ArrayLike] | ArrowStream
+class LazyFrame(Protocol):
+    """A frame that is computed when its rows are asked for, as polars has it."""
+
+    def collect(self) -> ArrowStream:
+        """Return the frame itself."""
+
+
+Frame = ArrowStream | LazyFrame
+Source = str | Path | Mapping[str, npt.ArrayLike] | Frame
+
+
+def is_frame(source: object) -> TypeIs[Frame]:
+    """Tell whether something is a frame, and no path, mapping or list of them."""
+    return hasattr(source, "__arrow_c_stream__") or callable(getattr(source, "collect", None))
 
 
 def open_source(source: Source, text: TextLayout | None = None) -> TableFile:
@@ -32,6 +48,19 @@ def open_source(source: Source, text: TextLayout | None = None) -> TableFile:
     """
     if isinstance(source, str | Path):
         return open_file(source, text)
+    return _open_table("arrays" if isinstance(source, Mapping) else "frame", _arrow_table(source))
+
+
+def write_source(source: Mapping[str, npt.ArrayLike] | Frame, folder: Path) -> Path:
+    """Write a frame, or a mapping of names to arrays, as a file; raises as `open_source` does."""
+    import pyarrow.parquet as pq
+
+    path = folder / ("arrays.parquet" if isinstance(source, Mapping) else "frame.parquet")
+    pq.write_table(_arrow_table(source), path)
+    return path
+
+
+def _arrow_table(source: Mapping[str, npt.ArrayLike] | Frame) -> Any:
     import pyarrow as pa
 
     if isinstance(source, Mapping):
@@ -43,14 +72,12 @@ def open_source(source: Source, text: TextLayout | None = None) -> TableFile:
         if len(set(lengths.values())) > 1:
             told = ", ".join(f"{name} {length}" for name, length in lengths.items())
             raise RecordingError(f"arrays: their lengths differ ({told}), give columns of one length")
-        return _open_table("arrays", pa.table(columns))
-    if hasattr(source, "__arrow_c_stream__"):
-        with one_line_errors(
-            "frame", "cannot be read", "give plain columns", (pa.ArrowException, TypeError, ValueError)
-        ):
-            return _open_table("frame", pa.table(source))
-    kind = type(source).__name__
-    raise TypeError(f"a recording is read from a path, a frame or a mapping of arrays, not from {kind}")
+        return pa.table(columns)
+    if not is_frame(source):
+        kind = type(source).__name__
+        raise TypeError(f"a recording is read from a path, a frame or a mapping of arrays, not from {kind}")
+    with one_line_errors("frame", "cannot be read", "give plain columns", (pa.ArrowException, TypeError, ValueError)):
+        return pa.table(source if hasattr(source, "__arrow_c_stream__") else source.collect())
 
 
 def _open_table(name: str, table: Any) -> TableFile:
