@@ -310,10 +310,10 @@ class Baseline(ShortRepr, LearnedEvidence):
         ['viscous_friction', 'inertia', 'coulomb_friction', 'offset']
         """
         rows = [
-            {"point": each.point, "coefficient": name, "value": value, "std": std}
-            for each in self.per_point
+            {"point": baseline.point, "coefficient": name, "value": value, "std": std}
+            for baseline in self.per_point
             for name, value, std in zip(
-                each.names, each.theta, np.sqrt(np.diag(each.covariance_array())).tolist(), strict=True
+                baseline.names, baseline.theta, np.sqrt(np.diag(baseline.covariance_array())).tolist(), strict=True
             )
         ]
         return frame_of("baseline", rows)
