@@ -41,6 +41,8 @@ def test_logs_with_the_names_of_makers_are_right_and_never_wrong_in_silence(tmp_
         ("t|Setpoint|Input|Output", "0123"),
         ("t|PID.Setpoint|PID.Input|PID.Output", "0132"),
         ("t|w|x|y", "0132"),
+        ("t|out.r|out.u|out.y|out.v_ref", "0123"),
+        ("TimeUS|RATE.AOut|RATE.ROut|RATE.R|RATE.RDes", "0423"),
         ("t|VL.CMD|PL.CMD|IL.CMD|PL.FB|IL.FB", "0234"),
         ("t|Position|ActualPosition|d_axis_current|q_axis_current", "0142"),
         ("t|measured current|setpoint|speed", "0213"),

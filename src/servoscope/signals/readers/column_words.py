@@ -36,7 +36,7 @@ POSITION = (
 )
 SPEED = (
     *("speed", "velocity", "velo", "vel", "rpm", "erpm", "drehzahl", "geschwindigkeit", "vitesse", "velocita"),
-    *("velocidad", "vcmd", "vl", "qd", "rate", "rates", "v", "速度", "转速"),
+    *("velocidad", "vcmd", "vl", "qd", "rates", "v", "速度", "转速"),
 )
 EFFORT = (
     *("torque", "trq", "tau", "tor", "moment", "drehmoment", "couple", "coppia", "par", "转矩", "扭矩", "力矩", "tcmd"),

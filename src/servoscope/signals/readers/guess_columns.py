@@ -57,6 +57,8 @@ def guess_columns(names: Sequence[str]) -> dict[str, str]:
     meanings = {name: meaning for name in names if name != time and _is_signal(meaning := describe_name(name))}
     guesses = {"t": time} if time else {}
     bare = {plain_text(meaning.own[-1]) if meaning.own else "": name for name, meaning in meanings.items()}
+    if {"r", "u", "y"} <= bare.keys():  # also out.r, out.u, out.y
+        return guesses | {letter: bare[letter] for letter in "ruy"}
     if {"w", "x", "y"} <= bare.keys() and not {"r", "u"} & bare.keys():  # DIN 19226: w is r, y is u, x is y
         return guesses | {"r": bare["w"], "u": bare["y"], "y": bare["x"]}
     r, y = _find_pair(meanings)
