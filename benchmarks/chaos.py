@@ -34,6 +34,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from reliability.aftermath import looked_at  # noqa: E402
 from reliability.fleet import BEGAN, LOOP, Fleet  # noqa: E402
+from reliability.people import ASSET, SETTINGS, People  # noqa: E402
 from reliability.plain import Plain  # noqa: E402
 from reliability.plc import SENDER, STACKS, Plc  # noqa: E402
 from reliability.servers import Cable, Mosquitto, Postgres, mosquitto, programs  # noqa: E402
@@ -70,6 +71,9 @@ EVENTS = {  # and the words of their rows
     "database": "crash of the database",
     "clock": f"clock of a sender two hours ahead for {JUMPED} blocks",
     "cable": f"cable pulled for {PULLED_S:g} s",
+    "files": "files of hostile names and clocks",
+    "commands": "commands of operators",
+    "relearning": "baseline put in force",
 }
 
 
@@ -100,6 +104,7 @@ class Chaos:
         self._plcs = {other: Plc(other, port, fleet, PLC) for other, port in listen.items()}
         self._port, self._log = free_port(), (fleet.folder / "chaos.log").open("ab")
         self.config, self._publish = self._files()
+        self.people = People(self.config, fleet.names, self._chance)
         self.happened: dict[str, list[float]] = {}
         self.latencies, self.largest_mb = Latencies(), 0.0
 
@@ -128,6 +133,7 @@ class Chaos:
                 f'nodes = {{ block = "{plc.node(name)}" }}'
                 for name in plc.names
             ]
+        service.append(SETTINGS)
         publish = [
             f"ahead = {AHEAD}\nagain_s = 2.0\n[replay]\nspeed = {self._fleet.speed}",
             f"block = {self._fleet.block_s}\nstart = {self._fleet.start}",
@@ -188,7 +194,7 @@ class Chaos:
         code = self._publisher.returncode
         assert code == 0, f"the publisher has ended with {code}, see {self._log.name}"
         self._plain.close()
-        time.sleep(2.0)
+        self.people.wait(LONGEST_S)
         self._service.send_signal(signal.SIGTERM)
         assert self._service.wait(120) == 0
         return set(range(self._plain.sent)), self._plain.misdated
@@ -208,6 +214,13 @@ class Chaos:
             time.sleep(PULLED_S)
             self._cables[name].pulled.clear()
             return (name,) if name in OTHERS else ("press",)
+        elif what == "files":
+            self.people.drop_files()
+            return (ASSET,)
+        elif what == "commands":
+            self.people.give_commands()
+        elif what == "relearning":
+            self.people.relearn()
         elif what == "clock":
             self._plain.jump(JUMPED)
             return ("plain",)
@@ -288,7 +301,7 @@ def trial(store: str, size: tuple[int, float, float], block_s: float, every_s: f
         begun, load = time.monotonic(), round(os.getloadavg()[0], 1)
         plain = chaos.run()
         seconds = round(time.monotonic() - begun, 1)
-        found = looked_at(fleet, chaos.config, plain, chaos.written)
+        found = looked_at(fleet, chaos.config, plain, chaos.written) | {"people": chaos.people.left()}
     settings = {"store": store, "hours": hours, "assets": assets, "speed": speed, "block_s": block_s}
     happened = {name: times for name, times in sorted(chaos.happened.items())}
     latency = {f"p{share:g}": quantile(chaos.latencies.calm, share / 100.0) for share in (50.0, 99.0)}
@@ -323,6 +336,7 @@ def column(one: dict[str, Any]) -> list[tuple[str, str]]:
         ("of them lost, counted twice; assets with other samples", wrong),
         ("assets whose rows are not numbered through", f"{one['misnumbered']}"),
         ("sent once more and left out", f"{one['left out as repeated']}"),
+        *((f"people: {name}", f"{count}") for name, count in one.get("people", {}).items()),
     ]
     for name, words in SENDERS.items():
         found = one[name]

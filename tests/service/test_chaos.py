@@ -19,5 +19,6 @@ def test_nothing_is_lost_between_senders_and_the_store() -> None:
     )
     for others in (found[name] for name in chaos.SENDERS):
         assert others["stored"] and others["unnamed"] == others["other"] == 0
+    assert not any(found["people"][key] for key in ("not counted", "without outcome", "rows set aside"))
     assert sum(map(len, found["happened"].values())) >= 3
     assert "0.5 h, 3 assets" in chaos.markdown([found])
