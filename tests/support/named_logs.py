@@ -1,6 +1,6 @@
 """Logs with the names of many makers' tools: simulated loops, their right columns written down beside each.
 
-`makers.toml` has the names and their sources. Makers are held out of tuning by turns of the alphabet.
+`makers.toml` has the names and their sources. On those of `makers_unseen.toml` nothing is tuned.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from servoscope.core.errors import ServoscopeError
 from servoscope.learning.proposal import propose_columns
 from servoscope.signals.readers import list_channels, read
 
-MAKERS = tomllib.loads(Path(__file__).with_name("makers.toml").read_text(encoding="utf-8"))["maker"]
+FAMILIES = {"seen": "makers.toml", "unseen": "makers_unseen.toml"}
 TO_SI = {
     **dict.fromkeys(("", "m", "rad", "rad/s", "counts", "inc", "qc", "pulse", "%", "A", "V", "N", "Nm", "s"), 1.0),
     **dict.fromkeys(("mm", "mA", "ms"), 1e-3), **dict.fromkeys(("um", "us"), 1e-6),
@@ -33,7 +33,7 @@ SPAN: dict[str, tuple[float, tuple[float, ...]]] = {
     "": (1.0, (0.0, 0.0, 5.0)), "m": (0.08, (0.0, 0.4)), "mm": (80.0, (0.0, 300.0, 600.0)), "um": (60.0, (0.0, 100.0)),
     "rad": (1.0, (0.0, 0.0, 3.0)), "deg": (60.0, (0.0, 180.0)), "Grad": (60.0, (0.0, 180.0)), "rev": (3.0, (0.0, 12.0)),
     "%": (12.0, (50.0,)), **dict.fromkeys(("counts", "inc", "qc", "pulse"), (40000.0, (0.0, 250000.0))),
-    "deg/s": (80.0, (0.0,)),
+    "deg/s": (80.0, (0.0,)), "rpm": (1500.0, (0.0,)), "rad/s": (150.0, (0.0,)),
 }  # fmt: skip
 EFFORT = {"": 1.0, "A": 3.0, "mA": 900.0, "%": 40.0, "Nm": 4.0, "V": 5.0, "N": 150.0}
 EFFORT_WORDS = {  # what an effort may be measured in, by what its name says
@@ -59,7 +59,6 @@ class NamedLog:
 
     file: str
     maker: str
-    held_out: bool
     header: tuple[str, ...]
     values: FloatArray  # rows, columns
     separator: str
@@ -160,7 +159,7 @@ def unit_of(kind: str, position: str, effort: str) -> str:
     return {**named, "bus": "V", "temperature": "°C"}.get(kind, "")
 
 
-def make(maker: dict[str, Any], number: int, *, held_out: bool) -> NamedLog:
+def make(maker: dict[str, Any], number: int) -> NamedLog:
     """Return one log of a maker's family."""
     rng = np.random.default_rng([number, *maker["maker"].encode()])
     rig = maker.get("rig", "axis")
@@ -230,7 +229,7 @@ def make(maker: dict[str, Any], number: int, *, held_out: bool) -> NamedLog:
     values = np.column_stack([np.array([float(f"{x:.10g}") for x in column]) for _, _, column in columns])
     truth = tuple((t, *answer) for answer in answers)
     header = tuple(name for name, _, _ in columns)
-    return NamedLog(file, maker["maker"], held_out, header, values, separator, decimal, units, truth, "; ".join(words))
+    return NamedLog(file, maker["maker"], header, values, separator, decimal, units, truth, "; ".join(words))
 
 
 def scale(values: FloatArray, kind: str, position: str, amplitude: float, middle: float, effort: float) -> FloatArray:
@@ -245,12 +244,12 @@ def scale(values: FloatArray, kind: str, position: str, amplitude: float, middle
     return 48.0 * values if kind == "bus" else values
 
 
-def named_logs(each: int = 10, makers: Sequence[str] = ()) -> Iterator[NamedLog]:
-    """Return so many logs of each maker; every other maker of the alphabet is held out."""
-    for place, maker in enumerate(sorted(MAKERS, key=lambda maker: str(maker["maker"]).lower())):
+def named_logs(each: int = 10, makers: Sequence[str] = (), family: str = "seen") -> Iterator[NamedLog]:
+    """Return so many logs of each maker of a family."""
+    text = Path(__file__).with_name(FAMILIES[family]).read_text(encoding="utf-8")
+    for maker in tomllib.loads(text)["maker"]:
         if not makers or maker["maker"] in makers:
-            for number in range(each):
-                yield make(maker, number, held_out=place % 2 == 1)
+            yield from (make(maker, number) for number in range(each))
 
 
 def find_outcome(log: NamedLog, folder: Path) -> tuple[Outcome, str]:
