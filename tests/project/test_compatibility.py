@@ -203,10 +203,14 @@ def test_a_monitor_says_the_same_to_the_last_bit(tmp_path: Path) -> None:
     assert seen == set(FROZEN["traces"])
 
 
+# what the motion explains of u sets the cutoff since 2.0, no longer the widest band of coherence
+INTENDED = {"inspect-axis": ["/0/suggested_cutoff_hz: 9.4, not 2.5"]}
+
+
 @pytest.mark.parametrize("name", sorted(results.COMMANDS))
 def test_a_command_prints_the_same_numbers(name: str, tmp_path: Path) -> None:
     rel = ITERATED if name.startswith("diagnose") else EXACT
-    assert differences(results.documents(name, tmp_path), stored("commands")[name], rel) == []
+    assert differences(results.documents(name, tmp_path), stored("commands")[name], rel) == INTENDED.get(name, [])
 
 
 def test_a_diagnosis_from_python_is_that_of_the_command() -> None:
