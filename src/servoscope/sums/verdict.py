@@ -85,9 +85,10 @@ class _Judgement:
                 total = self.gain(B) + cut.evidence
                 if total > best.evidence and any(part.changed for part in cut.stretches):
                     best = _Account(total, cut.stretches)
-                if all(part.changed for part in cut.stretches):
-                    break
-                B = self.effect(*self.of_healthy(cut.stretches))
+                # a recording begins healthy rather than not
+                healthy = any(not part.changed for part in cut.stretches)
+                first = (cut.stretches[0]._replace(changed=False),)
+                B = self.effect(*self.of_healthy(cut.stretches if healthy else first))
         return best
 
     def states(self, stretches: tuple[Stretch, ...]) -> tuple[Stretch, ...]:
