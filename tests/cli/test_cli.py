@@ -92,12 +92,12 @@ def test_simulate_says_how_to_read_columns_that_are_no_plain_names(made: Path, t
 
 def test_inspect_lists_the_columns_of_a_file_that_needs_a_mapping(made: Path, tmp_path: Path) -> None:
     rows = rows_of(made / "healthy.csv")
-    path = write_rows(tmp_path / "x.csv", {"zeit": rows["t"], "soll": rows["r"], "i": rows["u"], "ist": rows["y"]})
+    path = write_rows(tmp_path / "x.csv", {"zeit": rows["t"], "soll": rows["r"], "k": rows["u"], "ist": rows["y"]})
     result = run("inspect", path)
     assert result.code == 0 and result.err == ""
     assert "perhaps: --columns 't=zeit, r=soll, y=ist'" in result.out and "no name suggests u: say which" in result.out
     assert f"servoscopeinit{path}" in "".join(result.out.split())  # wrapped where the path is long
-    for name in ("zeit", "soll", "i", "ist"):
+    for name in ("zeit", "soll", "k", "ist"):
         assert f"  {name} " in result.out
     listed = json.loads(run("inspect", path, "--json").out)
     assert [channel["name"] for channel in listed["channels"]] == ["zeit", "soll", "i", "ist"]

@@ -64,7 +64,9 @@ class Account:
     def coefficients(self) -> HealthyScores | None:
         """Of T^2, where recordings scatter: noise alone has the distribution that its limit is made for."""
         scores = [ratio * self.baseline.thresholds.statistic for ratio in self.baseline.scatter.left_out]
-        known = len(scores) >= MIN_RECORDINGS and not self.baseline.thresholds.hypotheses
+        # a recording left out at an end of the range of covariates is extrapolated to, and scores far too much
+        between = self.baseline.covariates is None and not self.baseline.thresholds.hypotheses
+        known = between and len(scores) >= MIN_RECORDINGS
         return HealthyScores(scores, WIDE_PRIOR) if known else None
 
     @cached_property
