@@ -100,8 +100,8 @@ def test_inspect_lists_the_columns_of_a_file_that_needs_a_mapping(made: Path, tm
     for name in ("zeit", "soll", "k", "ist"):
         assert f"  {name} " in result.out
     listed = json.loads(run("inspect", path, "--json").out)
-    assert [channel["name"] for channel in listed["channels"]] == ["zeit", "soll", "i", "ist"]
-    mapped = run("inspect", path, "--columns", "t=zeit, r=soll, u=i, y=ist", "--report", tmp_path / "x.html")
+    assert [channel["name"] for channel in listed["channels"]] == ["zeit", "soll", "k", "ist"]
+    mapped = run("inspect", path, "--columns", "t=zeit, r=soll, u=k, y=ist", "--report", tmp_path / "x.html")
     assert mapped.code == 0
     assert "Usable" in mapped.out
     assert "<html" in (tmp_path / "x.html").read_text(encoding="utf-8")

@@ -181,7 +181,8 @@ def test_a_payload_that_hangs_there_from_the_start_is_weighed() -> None:
     baseline = ss.learn(settings, healthy[:6])
     assert [ss.diagnose(baseline, run).verdict for run in healthy[6:]] == ["healthy", "healthy"]
     loaded = [ss.diagnose(baseline, run) for run in sts3215.runs(folder, settings, 1.1682, 0.15, (16,))[:3]]
-    assert {diagnosis.verdict for diagnosis in loaded} == {"fault"}
+    # one recording that is unlike the six learned from is suspect
+    assert {diagnosis.verdict for diagnosis in loaded} == {"suspect"}
     weighed = [fault for diagnosis in loaded for fault in diagnosis.faults]
     assert {fault.name for fault in weighed} == {"payload"}
     for fault in weighed:

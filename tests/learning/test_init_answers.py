@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -23,16 +24,15 @@ def log(folder: Path, header: str, rows: list[str], name: str = "log.csv") -> Pa
     return path
 
 
-def doubts(out: str) -> dict[str, str]:
-    """Return the lines of a proposal that are in doubt, by their key."""
-    lines = [line.split() for line in out.splitlines() if " ? " in line]
-    return {words[0]: " ".join(words) for words in lines}
+def doubts(out: str) -> set[str]:
+    """Return the keys of a proposal that are in doubt."""
+    return set(re.findall(r"^  ! (\w+) = ", out, re.MULTILINE))
 
 
 def test_a_log_without_r_says_so(rows: list[str], tmp_path: Path) -> None:
     rows = [";".join(row.split(";")[k] for k in (0, 2, 3)) for row in rows]
     told = run("init", log(tmp_path, "t [ms];torque [Nm];position [mm]", rows), "-o", tmp_path / "loop.toml")
-    assert told.code == 0 and "columns.reference" in doubts(told.out)
+    assert told.code == 0 and "reference" in doubts(told.out)
     assert "no column fits" in told.out and "--columns 'r=...'" in " ".join(told.out.split())
     assert "no column fits" in (tmp_path / "loop.toml").read_text(encoding="utf-8")
     assert Loop.load(tmp_path / "loop.toml").columns.reference == "r"
@@ -58,13 +58,13 @@ def test_an_answer_keeps_the_other_guesses(rows: list[str], tmp_path: Path) -> N
 def test_a_clock_that_counts_is_in_doubt(rows: list[str], tmp_path: Path) -> None:
     rows = [f"{k};{row.split(';', 1)[1]}" for k, row in enumerate(rows)]
     told = run("init", log(tmp_path, "time;target;torque;position", rows), "-o", tmp_path / "loop.toml", "--yes")
-    assert "counts in steps of 1" in " ".join(told.out.split()) and "columns.time_unit" in doubts(told.out)
+    assert "counts in steps of 1" in " ".join(told.out.split()) and "time_unit" in doubts(told.out)
 
 
 def test_r_in_another_unit_is_in_doubt(rows: list[str], tmp_path: Path) -> None:
     rows = [";".join([row.split(";")[0], str(57.3 * float(row.split(";")[1])), *row.split(";")[2:]]) for row in rows]
     told = run("init", log(tmp_path, "t [ms];target;torque;position", rows), "-o", tmp_path / "loop.toml", "--yes")
-    assert "in another unit" in told.out and "columns.reference" in doubts(told.out)
+    assert "in another unit" in " ".join(told.out.split()) and "reference" in doubts(told.out)
 
 
 def test_a_stamp_and_a_constant_are_no_output(rows: list[str], tmp_path: Path) -> None:
