@@ -233,7 +233,7 @@ def test_what_a_user_writes_is_typed(tmp_path: Path) -> None:
     wrong.write_text('import servoscope as ss\n\nss.diagnose(3, "x.csv")\n')
     done = subprocess.run([*argv, example, wrong], cwd=PROJECT, capture_output=True, text=True, check=False)
     # mypy remembers what it said of the same lines in the folder of an earlier run
-    assert re.findall(r"(\w+\.py):\d+: error: .*\[(.*)\]$", done.stdout, re.M) == [(wrong.name, "arg-type")], (
+    assert re.findall(r"(\w+\.py):\d+: error: .*\[(.*)\]$", done.stdout, re.M) == [(wrong.name, "call-overload")], (
         done.stdout
     )
 

@@ -37,7 +37,9 @@ def queries() -> list[str]:
 def test_every_metric_is_there_and_every_metric_is_shown() -> None:
     writer = SimpleNamespace(unavailable_since=None, waiting=0, capacity=1)
     clock = {"last_turn": time.monotonic()}
-    service: Any = SimpleNamespace(assets={}, sources={}, troubles={}, writer=writer, layers=LayerTimes(), **clock)
+    service: Any = SimpleNamespace(
+        assets={}, sources={}, troubles={"connection": {}}, writer=writer, layers=LayerTimes(), **clock
+    )
     text = ServiceMetrics(service).render().decode()
     known = {name for name in re.findall(r"^# TYPE (\w+) ", text, re.MULTILINE) if not name.endswith("_created")}
     asked = "\n".join(target["expr"] for target in targets() if "expr" in target)

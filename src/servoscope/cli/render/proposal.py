@@ -64,9 +64,8 @@ def _doubts(proposal: LoopProposal) -> Iterator[str]:
     yield from map(render, proposal.notes)
     reasons: dict[str, list[Inspection]] = {}
     for _, inspected in proposal.inspections:
-        for finding in inspected.findings:
-            if finding.severity != "note":
-                reasons.setdefault(finding.kind, []).append(inspected)
+        for kind in dict.fromkeys(finding.kind for finding in inspected.findings if finding.severity != "note"):
+            reasons.setdefault(kind, []).append(inspected)
     for kind, shown in reasons.items():
         text = next(str(finding.message) for finding in shown[0].findings if finding.kind == kind)
         of = {"count": len(shown), "all": len(proposal.inspections)}
