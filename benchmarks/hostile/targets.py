@@ -107,6 +107,7 @@ def _files(folder: Path, recording: Recording) -> list[Target]:
     made = {"CSV": "csv", "Parquet": "parquet", "MAT 5": "mat", "MAT 7.3": "mat", "MDF": "mf4", "TDMS": "tdms"}
     made |= {"HDF5": "h5", "Excel": "xlsx", "LVM": "lvm", "MCAP": "mcap", "ULog": "ulg", "gzip": "csv.gz", "ZIP": "zip"}
     made |= {"JSON": "jsonl", "Feather": "feather", "NumPy": "npz", "SQLite": "db", "trace": "trace", "ROS 1": "bag"}
+    made |= {"halscope": "halscope"}
     writing: dict[str, Callable[[Path], object]] = {
         "MAT 5": lambda path: _mat(path, columns),
         "MAT 7.3": lambda path: _hdf5(path, columns),
@@ -119,6 +120,7 @@ def _files(folder: Path, recording: Recording) -> list[Target]:
         "ULog": lambda path: path.write_bytes(_ulog(columns)),
         "ROS 1": lambda path: _bag(path, columns),
         "trace": lambda path: path.write_text(_trace(columns)),
+        "halscope": lambda path: path.write_text(_halscope(columns)),
         "gzip": lambda path: path.write_bytes(gzip.compress(_text(columns).encode())),
         "ZIP": lambda path: _zip(path, columns),
         "JSON": lambda path: path.write_text(_records(columns)),
@@ -128,6 +130,7 @@ def _files(folder: Path, recording: Recording) -> list[Target]:
     }
     found = []
     named = dict.fromkeys((".mf4", ".mcap", ".bag", ".ulg", ".lvm"), Columns(time="time"))  # by their readers
+    named[".halscope"] = Columns(time="time")
     named[".trace"] = Columns(time="time [ms]", time_unit="ms")
     for kind, suffix in made.items():
         path = folder / f"{kind.replace(' ', '-')}.{suffix}"
@@ -241,6 +244,12 @@ def _trace(columns: dict[str, Any]) -> str:
         lines += [f"{number}.Variable; {name}", f"{number}.Data; "]
         lines += [f"; {1e3 * t:g}; {x:g}" for t, x in zip(columns["t"], columns[name], strict=True)]
     return "\n".join(lines)
+
+
+def _halscope(columns: dict[str, Any]) -> str:
+    rows = zip(*(columns[name] for name in "ruy"), strict=True)
+    head = "# Sampling period is 10000000 ns\nr;u;y\n"
+    return head + "".join(";".join(f"{x:.14f}" for x in row) + "\n" for row in rows)
 
 
 def _lvm(columns: dict[str, Any]) -> str:

@@ -14,7 +14,7 @@ const PAGES = {
   "how-to/own-log#4-inspect": ["Is the log usable?", "Is it usable?"],
   "how-to/own-log#5-learn": ["Healthy recordings", "What was learned"],
   "how-to/read-a-verdict#the-motion-signature": ["Motion signature"],
-  "how-to/read-a-verdict#the-three-verdicts": ["Verdict", "Diagnoses", "Diagnoses of recordings"],
+  "how-to/read-a-verdict#the-four-verdicts": ["Verdict", "Diagnoses", "Diagnoses of recordings"],
   "how-to/relearn": ["Baseline", "Baselines"],
   "how-to/robot-arm#in-a-service": ["The arm and its joints"],
   "how-to/trend": ["How it grows"],
