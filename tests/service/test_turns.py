@@ -254,7 +254,9 @@ def test_metrics_are_read_at_any_moment_of_a_turn(monitors: list[Monitor], monke
     together = {f"asset{i}": Asset(f"asset{i}", monitors[0].baselines[0], monitors[0], POLICY) for i in range(3)}
     groups, blocks, texts = AssetGroups(together), streams()["asset0"], list[bytes]()
     writer_now = SimpleNamespace(unavailable_since=None, waiting=0, capacity=1)
-    service = SimpleNamespace(assets=together, sources={}, troubles={"connection": {}}, layers=groups.layers, writer=writer_now)
+    service = SimpleNamespace(
+        assets=together, sources={}, troubles={"connection": {}}, layers=groups.layers, writer=writer_now
+    )
     service.last_turn = time.monotonic()
     metrics, states = ServiceMetrics(service), groups._fleets[0].states
     states._evaluations = states._evaluations.view(WatchedArray)

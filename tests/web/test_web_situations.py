@@ -286,10 +286,10 @@ def test_a_fleet_without_assets_leads_to_the_first_one(page: Any, tmp_path: Path
         playwright.expect(page.get_by_role("heading", name="Add a machine")).to_be_visible()
         playwright.expect(page.get_by_role("link", name="Begin with a log")).to_have_attribute("href", "/begin")
         accessible(page)
-        page.route("**/api/v1/assets", lambda route: route.fulfill(json=empty | {"configured": 6}))
+        page.route("**/api/v1/assets*", lambda route: route.fulfill(json=empty | {"configured": 6}))
         page.goto(base)
         playwright.expect(page.get_by_text("6 assets are configured, waiting for the first samples.")).to_be_visible()
-        page.unroute("**/api/v1/assets")
+        page.unroute("**/api/v1/assets*")
 
 
 def test_a_phone_shows_machines_first(page: Any, address: str) -> None:
