@@ -121,6 +121,6 @@ def decide(evidence: JudgeEvidence, limit: float, recordings: int = 0, before: V
     """
     kind: VerdictKind = "healthy"
     if evidence.nats > limit:
-        sure = evidence.inside or evidence.nats > SURE_LIMITS * limit or before in ("suspect", "fault")
+        sure = evidence.inside or evidence.nats > SURE_LIMITS * limit or before in FOUND
         kind = "fault" if sure else "suspect"
     return Verdict(kind, evidence.nats, limit, recordings, evidence.segments, evidence.inside)
