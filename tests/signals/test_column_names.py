@@ -8,7 +8,7 @@ import pytest
 from commands import run
 from hypothesis import given
 from hypothesis import strategies as st
-from named_logs import MAKERS, Outcome, find_outcome, named_logs
+from named_logs import Outcome, find_outcome, makers, named_logs
 
 from servoscope.core.errors import LoopError
 from servoscope.models.columns import Columns
@@ -23,7 +23,7 @@ from servoscope.signals.readers.units import split_unit
 def test_logs_with_the_names_of_makers_are_right_and_never_wrong_in_silence(tmp_path: Path) -> None:
     logs = list(named_logs(each=1))
     found = {log.file: find_outcome(log, tmp_path) for log in logs}
-    assert len(logs) >= 30 and all(maker["page"].startswith("https://") for maker in MAKERS)
+    assert len(logs) >= 30 and all(maker["page"].startswith("https://") for maker in makers())
     assert sum(outcome is Outcome.RIGHT for outcome, _ in found.values()) >= 0.9 * len(logs), found
     assert not {file: said for file, (outcome, said) in found.items() if outcome in (Outcome.WRONG, Outcome.UNIT)}
 

@@ -244,11 +244,16 @@ def scale(values: FloatArray, kind: str, position: str, amplitude: float, middle
     return 48.0 * values if kind == "bus" else values
 
 
-def named_logs(each: int = 10, makers: Sequence[str] = (), family: str = "seen") -> Iterator[NamedLog]:
-    """Return so many logs of each maker of a family."""
+def makers(family: str = "seen") -> list[dict[str, Any]]:
+    """Return the makers of a family: names, their page, rig and units of each."""
     text = Path(__file__).with_name(FAMILIES[family]).read_text(encoding="utf-8")
-    for maker in tomllib.loads(text)["maker"]:
-        if not makers or maker["maker"] in makers:
+    return list(tomllib.loads(text)["maker"])
+
+
+def named_logs(each: int = 10, only: Sequence[str] = (), family: str = "seen") -> Iterator[NamedLog]:
+    """Return so many logs of each maker of a family, or of those that `only` names."""
+    for maker in makers(family):
+        if not only or maker["maker"] in only:
             yield from (make(maker, number) for number in range(each))
 
 
