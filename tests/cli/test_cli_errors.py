@@ -161,14 +161,20 @@ def test_an_interrupt_is_quiet(made: Path, tmp_path: Path, monkeypatch: pytest.M
     assert (result.code, result.out, result.err) == (130, "", "")
 
 
-def test_an_extra_that_is_not_installed_is_named(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("module", "extra"),
+    [("sqlalchemy.exc", "service"), ("segno", "service"), ("prometheus_client", "service"), ("fastapi", "web")],
+)
+def test_an_extra_that_is_not_installed_is_named(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, extra: str
+) -> None:
     def missing(path: Path) -> None:
-        raise ModuleNotFoundError("No module named 'sqlalchemy'", name="sqlalchemy.exc")
+        raise ModuleNotFoundError(f"No module named '{module}'", name=module)
 
     monkeypatch.setattr("servoscope.models.loop.Loop.load", missing)
     result = run("simulate", made / "loop.toml", "-o", tmp_path / "x.csv")
     assert result.code == 1 and result.out == ""
-    assert result.err == "servoscope: sqlalchemy is missing, pip install 'servoscope[service]'\n"
+    assert result.err == f"servoscope: {module.partition('.')[0]} is missing, pip install 'servoscope[{extra}]'\n"
 
 
 def test_a_fault_of_the_program_keeps_its_traceback(

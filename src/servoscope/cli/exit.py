@@ -5,9 +5,11 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.metadata import requires
 from typing import Any
 
 import typer
@@ -16,12 +18,14 @@ import typer.core
 from servoscope.core.errors import ServoscopeError
 from servoscope.core.messages import say
 
-SERVICE_MODULES = (
-    "sqlalchemy",
-    "msgspec",
-    "httpx",
-)  # what `servoscope[service]` brings, on which its commands are built
 EXIT_INPUT, EXIT_FAULT, EXIT_SUSPECT, EXIT_INTERRUPTED = 1, 3, 4, 130  # exit codes; 2 is the command line's
+
+
+def find_extra(module: str) -> str | None:
+    """Return the extra of servoscope that brings a module, the service's before others, or None."""
+    needed = rf"{module.replace('_', '[-_]')}\W.*extra == '(\w+)'"
+    extras = {matched[1] for line in requires("servoscope") or () if (matched := re.match(needed, line, re.IGNORECASE))}
+    return min(extras - {"dev"}, key=lambda extra: (extra != "service", extra), default=None)
 
 
 class CommandGroup(typer.core.TyperGroup):
@@ -42,9 +46,10 @@ class CommandGroup(typer.core.TyperGroup):
             print_error(error)
             raise typer.Exit(EXIT_INPUT) from None
         except ModuleNotFoundError as error:
-            if (module := str(error.name).partition(".")[0]) not in SERVICE_MODULES:
+            module = str(error.name).partition(".")[0]
+            if (extra := find_extra(module)) is None:
                 raise
-            print_error(f"{module} is missing, pip install 'servoscope[service]'")
+            print_error(f"{module} is missing, pip install 'servoscope[{extra}]'")
             raise typer.Exit(EXIT_INPUT) from None
         except KeyboardInterrupt:
             raise typer.Exit(EXIT_INTERRUPTED) from None
