@@ -20,24 +20,24 @@ from pathlib import Path
 import numpy as np
 from tables import Table, parse_with_data, parser, show
 
-from servoscope.baseline.arm import ArmBaseline
-from servoscope.diagnosis.arm import diagnose_arm, examine_arm
-from servoscope.diagnosis.result import Diagnosis
-from servoscope.estimation.arm_regression import ArmSignals, block_information, filter_arm_log
-from servoscope.learning.arm import learn_arm
-from servoscope.learning.arm_setup import calibrate_load
-from servoscope.models.arm.dynamics import torque_regressor
-from servoscope.models.arm.model import FRICTION
-from servoscope.models.arm.settings import ArmLoop
-from servoscope.models.arm.urdf import parse_urdf
-from servoscope.signals.readers.arm_log import ArmRecording, read_arm_log
-from servoscope.simulation.arm import (
+from servoscope.arm.baseline import ArmBaseline
+from servoscope.arm.diagnosis import diagnose_arm, examine_arm
+from servoscope.arm.dynamics import torque_regressor
+from servoscope.arm.learning import learn_arm
+from servoscope.arm.log import ArmRecording, read_arm_log
+from servoscope.arm.model import FRICTION
+from servoscope.arm.regression import ArmSignals, block_information, filter_arm_log
+from servoscope.arm.settings import ArmLoop
+from servoscope.arm.setup import calibrate_load
+from servoscope.arm.simulation import (
     URDF,
     ArmChange,
     simulate_arm,
     simulated_arm,
     simulated_arm_loop,
 )
+from servoscope.arm.urdf import parse_urdf
+from servoscope.diagnosis.result import Diagnosis
 
 UR_GAINS = (14.87, 13.26, 11.13, 10.62, 11.03, 11.47)  # N m/A, De Luca's
 LEARNED_DAYS = ("20_02_05", "20_02_06", "20_02_10")

@@ -13,20 +13,15 @@ import pytest
 from scipy.ndimage import uniform_filter1d
 from typer.testing import CliRunner
 
-from servoscope.baseline.arm import ArmBaseline
-from servoscope.baseline.baseline import Baseline
-from servoscope.cli import app
-from servoscope.core.errors import BaselineError, LoopError, NotEnoughError, RecordingError
-from servoscope.core.messages import set_language
-from servoscope.diagnosis.arm import diagnose_arm, examine_arm
-from servoscope.estimation.arm_regression import filter_arm_log
-from servoscope.learning.arm import learn_arm
-from servoscope.learning.arm_setup import calibrate_load
-from servoscope.models.arm.settings import ArmLoop
-from servoscope.models.arm.urdf import parse_urdf
-from servoscope.report.arm_page import render_arm_page
-from servoscope.signals.readers.arm_log import ArmRecording, read_arm_log
-from servoscope.simulation.arm import (
+from servoscope.arm.baseline import ArmBaseline
+from servoscope.arm.diagnosis import diagnose_arm, examine_arm
+from servoscope.arm.learning import learn_arm
+from servoscope.arm.log import ArmRecording, read_arm_log
+from servoscope.arm.page import render_arm_page
+from servoscope.arm.regression import filter_arm_log
+from servoscope.arm.settings import ArmLoop
+from servoscope.arm.setup import calibrate_load
+from servoscope.arm.simulation import (
     GAINS,
     URDF,
     ArmChange,
@@ -34,6 +29,11 @@ from servoscope.simulation.arm import (
     simulated_arm,
     simulated_arm_loop,
 )
+from servoscope.arm.urdf import parse_urdf
+from servoscope.baseline.baseline import Baseline
+from servoscope.cli import app
+from servoscope.core.errors import BaselineError, LoopError, NotEnoughError, RecordingError
+from servoscope.core.messages import set_language
 
 UR_GAINS = (14.87, 13.26, 11.13, 10.62, 11.03, 11.47)
 UR_DAYS = ("20_02_05", "20_02_06", "20_02_10")
@@ -282,7 +282,7 @@ def write_bag(path: Path) -> None:
 
 def test_the_commands_take_an_arm(tmp_path: Path) -> None:
     """From the bags of a robot with ROS 2."""
-    from servoscope.simulation.arm import write_example
+    from servoscope.arm.simulation import write_example
 
     write_example(tmp_path)
     for name in ("day1", "day2", "day3", "tuesday", "pallet", "load"):

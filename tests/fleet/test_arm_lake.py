@@ -11,12 +11,12 @@ import pytest
 from arm_halls import FRICTION, ONSET_S, SIZE, write_arm
 from commands import run
 
+from servoscope.arm.simulation import simulate_arm
 from servoscope.fleet import Lake, Plan
 from servoscope.fleet import run as run_fleet
 from servoscope.fleet.arm_day import cut_windows
 from servoscope.fleet.rows import MICRO, Rows
 from servoscope.fleet.tasks import local
-from servoscope.simulation.arm import simulate_arm
 
 pytestmark = pytest.mark.slow
 

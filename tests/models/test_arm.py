@@ -9,15 +9,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from servoscope.arm.dynamics import torque_regressor
+from servoscope.arm.log import read_arm_log
+from servoscope.arm.model import ArmModel
+from servoscope.arm.settings import ArmLoop, describes_arm
+from servoscope.arm.setup import propose_arm_loop
+from servoscope.arm.simulation import GAINS, URDF, simulated_arm
+from servoscope.arm.urdf import parse_urdf
 from servoscope.core.errors import LoopError, RecordingError
-from servoscope.learning.arm_setup import propose_arm_loop
-from servoscope.models.arm.dynamics import torque_regressor
-from servoscope.models.arm.model import ArmModel
-from servoscope.models.arm.settings import ArmLoop, describes_arm
-from servoscope.models.arm.urdf import parse_urdf
 from servoscope.models.loop import Loop
-from servoscope.signals.readers.arm_log import read_arm_log
-from servoscope.simulation.arm import GAINS, URDF, simulated_arm
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "arm.npz"
 

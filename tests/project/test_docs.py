@@ -115,7 +115,7 @@ def test_every_command_and_option_is_documented() -> None:
 
 
 def test_every_key_of_the_loop_file_is_documented() -> None:
-    from servoscope.models.arm.settings import ArmLoop, JointColumns
+    from servoscope.arm.settings import ArmLoop, JointColumns
 
     missing = []
     for words, key in keys_of_loop_file():
@@ -179,8 +179,8 @@ def wrong_default(field: FieldInfo, cell: str) -> bool:
 
 
 def test_documented_defaults_are_those_of_the_code() -> None:
+    from servoscope.arm.settings import ArmLoop, JointColumns
     from servoscope.models import plants
-    from servoscope.models.arm.settings import ArmLoop, JointColumns
     from servoscope.models.loop import Columns, Controller, Loop, MonitorSettings
     from servoscope.service.config import ServiceFile
     from servoscope.service.kinds import PUBLISHERS, SOURCES, find_kinds

@@ -23,8 +23,8 @@ from documents import CodeBlock, code_blocks, command_lines, run_page
 from sources import load
 
 import servoscope as ss
+from servoscope.arm.settings import ArmLoop
 from servoscope.cli import app
-from servoscope.models.arm.settings import ArmLoop
 from servoscope.models.loop import Loop
 from servoscope.service.config import ServiceFile
 

@@ -12,14 +12,14 @@ from arm_halls import FRICTION, ONSET_S, SIZE, arm_hall, replayed_arm, write_arm
 from brokers import BEGAN, Running, Sender, started_broker, until
 from halls import asked, service_of
 
-from servoscope.baseline.arm import ArmBaseline
+from servoscope.arm.baseline import ArmBaseline
+from servoscope.arm.simulation import simulated_arm_loop
 from servoscope.core.errors import ConfigError
 from servoscope.service.build import build_assets, build_source, check_service_file
 from servoscope.service.config import ServiceFile
 from servoscope.service.diagnosis_worker import find_due_prognosis
 from servoscope.service.sources.block import Block
 from servoscope.service.sources.message import InboxMessage
-from servoscope.simulation.arm import simulated_arm_loop
 
 pytestmark = pytest.mark.slow  # minutes of six joints are simulated and diagnosed
 

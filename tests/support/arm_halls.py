@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from servoscope.learning.arm import learn_arm
-from servoscope.signals.readers.arm_log import read_arm_log
-from servoscope.simulation.arm import URDF, ArmChange, simulate_arm, simulated_arm, simulated_arm_loop
+from servoscope.arm.learning import learn_arm
+from servoscope.arm.log import read_arm_log
+from servoscope.arm.simulation import URDF, ArmChange, simulate_arm, simulated_arm, simulated_arm_loop
 
 WINDOW_S, ONSET_S, SIZE = 20.0, 45.0, 1.6
 FRICTION = "friction of elbow"

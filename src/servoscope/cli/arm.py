@@ -17,7 +17,7 @@ from servoscope.core.files import atomic_write
 from servoscope.core.messages import render, say
 
 if TYPE_CHECKING:
-    from servoscope.baseline.arm import ArmBaseline
+    from servoscope.arm.baseline import ArmBaseline
 
 
 def refuse_options(options: Mapping[str, object]) -> None:
@@ -31,8 +31,8 @@ def write_proposal(logs: Sequence[Path], urdf: Path, output: Path, replace: bool
     """Propose the loop file of an arm from a log and its URDF, write it, and print it."""
     import os
 
+    from servoscope.arm.setup import propose_arm_loop
     from servoscope.cli.render import results
-    from servoscope.learning.arm_setup import propose_arm_loop
 
     if output.exists() and not replace:
         raise OutputError(f"{output}: exists; name another file with -o, or replace it with --yes")
@@ -56,10 +56,10 @@ def calibrate(
     """Find the drive gains of an arm from a load of known mass, and write its loop file with them."""
     check_output(output, "-o", (".toml",), [baseline, log])
 
-    from servoscope.baseline.arm import ArmBaseline
+    from servoscope.arm.baseline import ArmBaseline
+    from servoscope.arm.log import read_arm_log
+    from servoscope.arm.setup import calibrate_load
     from servoscope.cli.render import results
-    from servoscope.learning.arm_setup import calibrate_load
-    from servoscope.signals.readers.arm_log import read_arm_log
 
     if (healthy := ArmBaseline.load(baseline)) is None:
         raise BaselineError(f'{baseline}: is no baseline of an arm, give one that learn wrote for kind = "arm"')
@@ -83,10 +83,10 @@ def calibrate(
 
 def learn_baseline(loop: Path, logs: Sequence[Path], output: Path, as_json: bool) -> None:
     """Learn the baseline of an arm from healthy logs, write it, and print it."""
+    from servoscope.arm.learning import learn_arm
+    from servoscope.arm.log import read_arm_log
+    from servoscope.arm.settings import ArmLoop
     from servoscope.cli.render import results
-    from servoscope.learning.arm import learn_arm
-    from servoscope.models.arm.settings import ArmLoop
-    from servoscope.signals.readers.arm_log import read_arm_log
 
     settings, urdf = ArmLoop.load(loop)
     arm = settings.kinematics(urdf, settings.urdf)
@@ -125,10 +125,10 @@ def diagnose_logs(
     baseline: ArmBaseline, logs: Sequence[Path], as_json: bool, report: Path | None, fail_on_fault: bool, details: bool
 ) -> None:
     """Diagnose logs of an arm, print the verdicts, and write reports on them."""
+    from servoscope.arm.diagnosis import examine_arm
+    from servoscope.arm.log import read_arm_log
     from servoscope.cli.render import diagnosis, results
-    from servoscope.diagnosis.arm import examine_arm
     from servoscope.report import document, plain_values
-    from servoscope.signals.readers.arm_log import read_arm_log
 
     pages = OutputPaths.from_option(report, ".html", len(logs) > 1, logs)
     failures, faulty = FailureCounter(), False
@@ -144,7 +144,7 @@ def diagnose_logs(
                     results.create_console(), result, document.DETAILS if details else document.EVIDENCE
                 )
             if pages is not None:
-                from servoscope.report.arm_page import write_arm_page  # late: it draws
+                from servoscope.arm.page import write_arm_page  # late: it draws
 
                 pages.write(path, recording.name, write_arm_page, result, examination, baseline, stderr=as_json)
     if fail_on_fault and faulty:

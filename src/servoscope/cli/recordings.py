@@ -166,8 +166,8 @@ def learn(
     alike = arguments.expand_baselines(population or [])
     check_output(output, "-o", (), [loop, *files, *alike, *filter(None, [compare])])
 
+    from servoscope.arm.settings import describes_arm
     from servoscope.cli.render import results
-    from servoscope.models.arm.settings import describes_arm
     from servoscope.report import plain_values
 
     if describes_arm(loop):
@@ -267,7 +267,7 @@ def diagnose(
     check_output(report, "--report", REPORTS, inputs, folder=True)
     check_output(trace, "--trace", TRACES, inputs, folder=True)
 
-    from servoscope.baseline.arm import ArmBaseline
+    from servoscope.arm.baseline import ArmBaseline
     from servoscope.baseline.baseline import Baseline
     from servoscope.cli.render import diagnosis, results
     from servoscope.diagnosis.diagnose import diagnose as diagnose_recording

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 from servoscope.core.messages import Message, catalogue, message, text_message
 from servoscope.diagnosis.result import FaultInterval
-from servoscope.models.arm.settings import ArmLoop
 from servoscope.models.loop import Loop
 
 MIN_PROBABILITY_CHECKED = 0.05  # probability from which an explanation is worth a look where none is certain
@@ -26,11 +25,8 @@ def suspects(interval: FaultInterval) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def checks_of_fault(loop: Loop | ArmLoop, name: str) -> Iterator[Message]:
+def checks_of_fault(loop: Loop, name: str) -> Iterator[Message]:
     """Yield what to check for one fault; nothing where nobody has said it."""
-    if isinstance(loop, ArmLoop):
-        yield message(f"arm.check.{name.partition(' of ')[0].replace(' ', '_')}")
-        return
     checks = next((fault.checks for fault in loop.plant.all_faults if fault.name == name), "")
     if name in (loop.checks or {}):
         yield from map(text_message, (loop.checks or {})[name])

@@ -6,10 +6,10 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from servoscope.baseline.arm import ArmBaseline
+from servoscope.arm.baseline import ArmBaseline
+from servoscope.arm.diagnosis import examine_window
 from servoscope.core.errors import NotEnoughError
 from servoscope.core.messages import Message
-from servoscope.diagnosis.arm import examine_window
 from servoscope.diagnosis.result import Diagnosis
 from servoscope.fleet.read import read_blocks
 from servoscope.fleet.rows import MICRO, Rows

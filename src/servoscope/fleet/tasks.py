@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from servoscope.baseline.arm import ArmBaseline
+from servoscope.arm.baseline import ArmBaseline
 from servoscope.core.errors import NotEnoughError, ServoscopeError
 from servoscope.core.files import atomic_write, make_folder
 from servoscope.core.workers import Progress, WorkerError, Workers

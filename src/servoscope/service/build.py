@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from servoscope.baseline.arm import AnyBaseline, ArmBaseline, load_baseline
+from servoscope.arm.baseline import AnyBaseline, ArmBaseline, load_baseline
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import BaselineError, ConfigError, LoopError
 from servoscope.core.settings_errors import suggest_name

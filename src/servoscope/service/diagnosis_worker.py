@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any
 
-from servoscope.baseline.arm import AnyBaseline, ArmBaseline
+from servoscope.arm.baseline import AnyBaseline, ArmBaseline
 from servoscope.baseline.baseline import Baseline
 from servoscope.core.workers import WorkerError, Workers
 from servoscope.design.operating_limits import OperatingLimit

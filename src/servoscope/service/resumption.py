@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 from itertools import chain
 from typing import NamedTuple
 
-from servoscope.baseline.arm import ArmBaseline
+from servoscope.arm.baseline import ArmBaseline
 from servoscope.baseline.history import read_history
 from servoscope.core.errors import BaselineError, StateError
 from servoscope.service.assets.asset import Asset

@@ -8,12 +8,11 @@ from collections.abc import Iterable
 import sqlalchemy as sa
 from starlette.exceptions import HTTPException
 
+from servoscope.arm.baseline import AnyBaseline, ArmBaseline
 from servoscope.core.errors import BaselineError
-from servoscope.core.messages import translate
+from servoscope.core.messages import Message, translate
 from servoscope.diagnosis.change_words import fault_label
 from servoscope.diagnosis.checks import checks_of_fault, suspects
-from servoscope.models.arm.settings import ArmLoop
-from servoscope.models.loop import Loop
 from servoscope.service.assets.status import AssetStatus
 from servoscope.service.store import Row, tables
 from servoscope.service.store.series import read_checks
@@ -38,29 +37,34 @@ def asset_checks(context: Context, asset: str, status: AssetStatus, row: Row | N
         return []
     diagnosis = read_diagnosis(row["document"]) if row is not None else None
     names = [fault.name for fault in status.faults] or (suspects(diagnosis.current) if diagnosis is not None else ())
-    loop = asset_loop(context, asset)
-    checks = fault_checks(context, asset, loop, names)
+    checks = fault_checks(context, asset, asset_baseline(context, asset), names)
     if not any(check.texts for check in checks) and diagnosis is not None:  # its baseline is not here any more
         return [FaultCheck(fault="", label="", texts=[str(text) for text in diagnosis.checks])]
     return checks
 
 
-def fault_checks(context: Context, asset: str, loop: Loop | ArmLoop | None, names: Iterable[str]) -> list[FaultCheck]:
+def fault_checks(context: Context, asset: str, baseline: AnyBaseline | None, names: Iterable[str]) -> list[FaultCheck]:
     """Return what to check on an asset for each of these faults."""
     own, checks = read_checks(context.store, asset), []
     for name in names:
         row = own.get(name, {})
-        texts = row.get("texts") or ([str(text) for text in checks_of_fault(loop, name)] if loop is not None else [])
+        texts = row.get("texts") or [str(text) for text in _known_checks(baseline, name)]
         who = {"who": row["who"], "at": row["at"]} if row.get("texts") else {}
         checks.append(FaultCheck(fault=name, label=translate(fault_label(name)), texts=texts, **who))
     return checks
 
 
-def asset_loop(context: Context, asset: str) -> Loop | ArmLoop | None:
-    """Return the loop that an asset is compared with; None where its baseline is not here."""
+def _known_checks(baseline: AnyBaseline | None, name: str) -> Iterable[Message]:
+    if isinstance(baseline, ArmBaseline):
+        return baseline.checks(name)
+    return () if baseline is None else checks_of_fault(baseline.loop, name)
+
+
+def asset_baseline(context: Context, asset: str) -> AnyBaseline | None:
+    """Return the baseline that an asset is compared with; None where it is not here."""
     id_ = asset_baseline_id(context, asset)
     if id_ is None:
         return None
     with contextlib.suppress(HTTPException, BaselineError):
-        return load_cached(find_baseline(context, id_).path).loop
+        return load_cached(find_baseline(context, id_).path)
     return None

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from servoscope.baseline.arm import ArmBaseline
+from servoscope.arm.baseline import ArmBaseline
 from servoscope.service.assets.arm_monitor import ArmMonitor
 from servoscope.service.assets.asset import Asset, AssetPolicy
 from servoscope.service.assets.block_lanes import Followed

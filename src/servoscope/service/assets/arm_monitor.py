@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from servoscope.baseline.arm import ArmBaseline
+from servoscope.arm.baseline import ArmBaseline
 from servoscope.core.arrays import FloatArray
 from servoscope.detection.covariate_monitor import CovariateHistory
 from servoscope.diagnosis.monitor import Monitor

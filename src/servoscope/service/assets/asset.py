@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from servoscope.baseline.arm import AnyBaseline
+from servoscope.arm.baseline import AnyBaseline
 from servoscope.core.errors import StateError
 from servoscope.core.messages import message, render
 from servoscope.diagnosis.schedule import DiagnosisSchedule

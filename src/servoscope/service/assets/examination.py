@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from servoscope.baseline.arm import AnyBaseline, ArmBaseline
+from servoscope.arm.baseline import AnyBaseline, ArmBaseline
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.covariates import hold_last
 from servoscope.core.errors import RecordingError, ServoscopeError
@@ -219,7 +219,7 @@ def _diagnose_loop(baseline: Baseline, name: str, blocks: Sequence[Block]) -> tu
 
 
 def _diagnose_arm(baseline: ArmBaseline, name: str, blocks: Sequence[Block]) -> tuple[Diagnosis, float, dict[str, Any]]:
-    from servoscope.diagnosis.arm import examine_window
+    from servoscope.arm.diagnosis import examine_window
 
     t, _, _, _, *signals = np.concatenate([block.signals for block in blocks], axis=1)
     window = examine_window(baseline, name, t, dict(zip(baseline.logged_covariates, signals, strict=True)))

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from servoscope.baseline.arm import AnyBaseline, ArmBaseline
+from servoscope.arm.baseline import AnyBaseline, ArmBaseline
 from servoscope.baseline.records import Occasion
 from servoscope.core.messages import message, render
 from servoscope.core.verdict import VerdictKind

@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from servoscope.arm.baseline import ArmBaseline
+from servoscope.arm.log import read_arm_log
 from servoscope.assessment.assess import assess
 from servoscope.assessment.tags import find_loops
-from servoscope.baseline.arm import ArmBaseline
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.comparison import compare_baselines
 from servoscope.core.errors import RecordingError
@@ -37,7 +38,6 @@ from servoscope.report import plain_values
 from servoscope.report.downsample import downsample_indices, json_numbers, signal_columns
 from servoscope.service.renewal import read_stretch
 from servoscope.signals import Recording, readers
-from servoscope.signals.readers.arm_log import read_arm_log
 from servoscope.signals.readers.axes import moving_axes, signals_of_one_axis
 from servoscope.signals.readers.formats import open_file
 from servoscope.signals.readers.guess_columns import guess_mapping
@@ -181,8 +181,8 @@ def _keep_diagnosis(out: Path, diagnosis: Diagnosis, data: JsonObject, used: str
 def _diagnose_arm(
     file: str, request: requests.DiagnosisRequest, baseline: ArmBaseline, name: str, out: Path
 ) -> JsonObject:
-    from servoscope.diagnosis.arm import examine_arm
-    from servoscope.report.arm_page import write_arm_page
+    from servoscope.arm.diagnosis import examine_arm
+    from servoscope.arm.page import write_arm_page
 
     refused = [key for key in ("point", "where", "from_s", "to_s") if getattr(request, key) not in (None, {})]
     if refused:

@@ -22,7 +22,7 @@ from servoscope.service.store.queries import query_downsampled, query_history
 from servoscope.service.store.rows import CHECKS, NOTE
 from servoscope.service.store.series import FAULT_KINDS, query_sizes, read_notes, read_series, thin_columns
 from servoscope.web.asset_document import has_open_fault
-from servoscope.web.checks import asset_checks, asset_loop, fault_checks, last_full_diagnosis
+from servoscope.web.checks import asset_baseline, asset_checks, fault_checks, last_full_diagnosis
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
 from servoscope.web.routes.baselines import asset_baseline_id, find_baseline, load_cached, load_loop_baseline
 from servoscope.web.schemas import assets as schemas
@@ -188,7 +188,7 @@ def write_checks(
 ) -> list[responses.FaultCheck]:
     """Write what to check on it for a fault, in words of one's own; the audit keeps who did, and what was there."""
     context.store.add_audit(who.user, asset, CHECKS, request.model_dump())
-    return fault_checks(context, asset, asset_loop(context, asset), [request.fault])
+    return fault_checks(context, asset, asset_baseline(context, asset), [request.fault])
 
 
 @router.get("/assets/{asset}/trend")

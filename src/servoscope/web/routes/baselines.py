@@ -13,7 +13,7 @@ from typing import Any
 from fastapi import APIRouter, HTTPException, Response
 from fastapi.responses import FileResponse
 
-from servoscope.baseline.arm import AnyBaseline, ArmBaseline, load_baseline
+from servoscope.arm.baseline import AnyBaseline, ArmBaseline, load_baseline
 from servoscope.baseline.baseline import Baseline
 from servoscope.models.loop import Loop
 from servoscope.report import plain_values

@@ -7,7 +7,7 @@ from functools import partial
 
 from fastapi import APIRouter, HTTPException
 
-from servoscope.baseline.arm import ArmBaseline
+from servoscope.arm.baseline import ArmBaseline
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.history import history_folder
 from servoscope.service import renewal

@@ -12,15 +12,15 @@ from typing import Any, NamedTuple, Self, TypeAlias
 import numpy as np
 from pydantic import Field, ValidationError
 
+from servoscope.arm.model import FRICTION, ArmModel
+from servoscope.arm.regression import ANGLE_STEP, ArmSignals
+from servoscope.arm.settings import ArmLoop
 from servoscope.baseline.baseline import ARM_FORMAT, Baseline
 from servoscope.baseline.records import BaselineModel, BaselineSource, Matrix, Vector
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, LoopError
 from servoscope.core.files import atomic_write
-from servoscope.core.messages import MessageText
-from servoscope.estimation.arm_regression import ANGLE_STEP, ArmSignals
-from servoscope.models.arm.model import FRICTION, ArmModel
-from servoscope.models.arm.settings import ArmLoop
+from servoscope.core.messages import Message, MessageText, message
 
 VERSION = 2
 HEAD_LENGTH = 200  # characters, in which a baseline says what it is
@@ -179,6 +179,12 @@ class ArmBaseline(BaselineModel):
     def fault_names(self) -> tuple[str, ...]:
         """Names of the faults that may be found."""
         return tuple(dict.fromkeys(cause.name for cause in self.causes if cause.kind != UNKNOWN))
+
+    def checks(self, fault: str) -> tuple[Message, ...]:
+        """Return what to check on the arm for one of its faults."""
+        kind = fault.partition(" of ")[0]
+        known = any(cause.kind == kind for cause in self.causes)
+        return (message(f"arm.check.{kind.replace(' ', '_')}"),) if known else ()
 
     def save(self, path: str | Path) -> None:
         """Write the baseline as JSON; nothing half-written stays behind."""

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from servoscope.arm.model import ArmModel
+from servoscope.arm.regression import ArmSignals
 from servoscope.core.arrays import BoolArray, FloatArray
-from servoscope.estimation.arm_regression import ArmSignals
-from servoscope.models.arm.model import ArmModel
 
 EVENT_WINDOW_S = 0.5  # over which the torque is averaged
 EVENT_MARGIN = 2.0  # times the largest of healthy recordings

@@ -18,10 +18,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from servoscope.arm.dynamics import LINK_PARAMETERS, torque_regressor
+from servoscope.arm.settings import ArmLoop
+from servoscope.arm.urdf import Kinematics
 from servoscope.core.arrays import FloatArray, IndexArray
-from servoscope.models.arm.dynamics import LINK_PARAMETERS, torque_regressor
-from servoscope.models.arm.settings import ArmLoop
-from servoscope.models.arm.urdf import Kinematics
 
 RANK_TOLERANCE = 1e-8  # of the largest diagonal entry of R, below which a parameter depends on others
 RANDOM_SAMPLES = 40  # of random motion, from which the base parameters are found

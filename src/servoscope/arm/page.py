@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from servoscope.baseline.arm import ArmBaseline
+from servoscope.arm.baseline import ArmBaseline
+from servoscope.arm.diagnosis import ArmExamination
 from servoscope.core.messages import say, translate
-from servoscope.diagnosis.arm import ArmExamination
 from servoscope.diagnosis.result import Diagnosis
 from servoscope.report.diagnosis_document import LABELS, diagnosis_document
 from servoscope.report.document import DETAILS, EVIDENCE, PicturePart, Section, to_html

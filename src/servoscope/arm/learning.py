@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servoscope.baseline.arm import (
+from servoscope.arm.baseline import (
     ArmBaseline,
     arm_causes,
     coefficient_names,
@@ -18,31 +18,31 @@ from servoscope.baseline.arm import (
     deviation_scales,
     loosen,
 )
-from servoscope.baseline.records import BaselineSource
-from servoscope.core.arrays import FloatArray, to_tuples
-from servoscope.core.blas import with_one_blas_thread
-from servoscope.core.errors import NotEnoughError, RecordingError
-from servoscope.core.messages import Message, message
-from servoscope.detection.arm_events import EVENT_MARGIN, MIN_EVENT_LIMIT, MIN_EVENT_SHARE, outside_torque
-from servoscope.detection.arm_evidence import (
+from servoscope.arm.events import EVENT_MARGIN, MIN_EVENT_LIMIT, MIN_EVENT_SHARE, outside_torque
+from servoscope.arm.evidence import (
     BETWEEN_SHARE,
     DRIFT_SHARE,
     ChangeTest,
     random_effect,
     second_half,
 )
-from servoscope.estimation.arm_regression import (
+from servoscope.arm.log import ArmRecording
+from servoscope.arm.model import ArmModel
+from servoscope.arm.regression import (
     MIN_MOVING_S,
     ArmSignals,
     Information,
     block_information,
     filter_arm_log,
 )
-from servoscope.learning.arm_setup import nominal_gains
-from servoscope.models.arm.model import ArmModel
-from servoscope.models.arm.settings import ArmLoop
-from servoscope.models.arm.urdf import Kinematics
-from servoscope.signals.readers.arm_log import ArmRecording
+from servoscope.arm.settings import ArmLoop
+from servoscope.arm.setup import nominal_gains
+from servoscope.arm.urdf import Kinematics
+from servoscope.baseline.records import BaselineSource
+from servoscope.core.arrays import FloatArray, to_tuples
+from servoscope.core.blas import with_one_blas_thread
+from servoscope.core.errors import NotEnoughError, RecordingError
+from servoscope.core.messages import Message, message
 
 FIT_STEPS = 3  # of least squares, each weighted by what the one before left of each joint's torque
 INFLATION_BLOCK_S = 2.0  # longer than the residual is correlated

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from servoscope.arm.urdf import Kinematics
 from servoscope.core.arrays import FloatArray
-from servoscope.models.arm.urdf import Kinematics
 
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)  # m/s^2, in the frame of the base
 SAMPLES_PER_PIECE = 2048  # so that the components of all joints stay in the cache

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from servoscope.arm.dynamics import torque_regressor
+from servoscope.arm.settings import ArmLoop
+from servoscope.arm.urdf import Kinematics, parse_urdf
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import SimulationError
 from servoscope.core.files import atomic_write
-from servoscope.models.arm.dynamics import torque_regressor
-from servoscope.models.arm.settings import ArmLoop
-from servoscope.models.arm.urdf import Kinematics, parse_urdf
 
-URDF = files("servoscope.simulation").joinpath("six_joints.urdf")
+URDF = files("servoscope.arm").joinpath("six_joints.urdf")
 RATE = 200.0  # Hz, of the simulation
 LOG_EVERY = 2  # samples
 RAMP_S = 0.2  # over which a change comes

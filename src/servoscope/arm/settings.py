@@ -10,6 +10,8 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
+from servoscope.arm.dynamics import STANDARD_GRAVITY
+from servoscope.arm.urdf import Kinematics, parse_urdf
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import LoopError
 from servoscope.core.settings import (
@@ -23,8 +25,6 @@ from servoscope.core.settings import (
     read_toml_text,
 )
 from servoscope.core.settings_errors import describe_error
-from servoscope.models.arm.dynamics import STANDARD_GRAVITY
-from servoscope.models.arm.urdf import Kinematics, parse_urdf
 from servoscope.models.loop import Loop
 
 OF_ALL_JOINTS = ("velocity", "target", "target_torque")  # columns that all joints have, or none

@@ -9,16 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from servoscope.baseline.arm import SERVICE_ODDS, UNKNOWN, ArmBaseline, ArmCause
-from servoscope.core.arrays import BoolArray, FloatArray
-from servoscope.core.blas import with_one_blas_thread
-from servoscope.core.errors import RecordingError
-from servoscope.core.messages import Message, message
-from servoscope.core.verdict import VerdictKind
-from servoscope.detection.arm_events import ArmEvent, find_events, outside_events, outside_torque, target_jumps
-from servoscope.detection.arm_evidence import INTERVAL, MIN_END_BLOCKS, CauseEvidence, ChangeEvidence, ChangeTest
-from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, FaultInterval, FinalCoefficient
-from servoscope.estimation.arm_regression import (
+from servoscope.arm.baseline import SERVICE_ODDS, UNKNOWN, ArmBaseline, ArmCause
+from servoscope.arm.dynamics import joint_positions
+from servoscope.arm.events import ArmEvent, find_events, outside_events, outside_torque, target_jumps
+from servoscope.arm.evidence import INTERVAL, MIN_END_BLOCKS, CauseEvidence, ChangeEvidence, ChangeTest
+from servoscope.arm.log import ArmRecording, read_arm_log
+from servoscope.arm.regression import (
     MIN_MOVING_S,
     ArmSignals,
     Information,
@@ -26,9 +22,13 @@ from servoscope.estimation.arm_regression import (
     block_information,
     filter_arm_log,
 )
+from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.core.blas import with_one_blas_thread
+from servoscope.core.errors import RecordingError
+from servoscope.core.messages import Message, message
+from servoscope.core.verdict import VerdictKind
+from servoscope.diagnosis.result import Diagnosis, DiagnosisWarning, FaultInterval, FinalCoefficient
 from servoscope.isolation.candidate import Candidate, FaultEstimate
-from servoscope.models.arm.dynamics import joint_positions
-from servoscope.signals.readers.arm_log import ArmRecording, read_arm_log
 
 MIN_CERTAINTY = 0.9  # probability from which a cause is named
 MIN_EXPLAINED = 0.5  # share of the evidence of an unknown change from which one cause is named all the same

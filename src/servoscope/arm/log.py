@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from servoscope.arm.settings import ArmLoop
+from servoscope.arm.urdf import Kinematics
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import RecordingError
-from servoscope.models.arm.settings import ArmLoop
-from servoscope.models.arm.urdf import Kinematics
 from servoscope.signals.readers.frames import Source
 from servoscope.signals.readers.recording_file import read_channels
 from servoscope.signals.resample import ResampleTarget, resample_rows

@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from servoscope.arm.log import ArmRecording
+from servoscope.arm.model import ArmModel
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import NotEnoughError
-from servoscope.models.arm.model import ArmModel
-from servoscope.signals.readers.arm_log import ArmRecording
 
 FILTER_ORDER = 3
 MOTION_CUTOFF = 2.0  # times the cutoff: of the filter on positions, before they are differentiated

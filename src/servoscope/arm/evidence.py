@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servoscope.baseline.arm import ArmCause
+from servoscope.arm.baseline import ArmCause
+from servoscope.arm.regression import Information
 from servoscope.core.arrays import FloatArray
-from servoscope.estimation.arm_regression import Information
 
 MIN_END_BLOCKS = 1  # blocks of a recording that a change has to last
 INTERVAL = 1.96  # standard deviations, on both sides

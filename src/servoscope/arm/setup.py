@@ -10,20 +10,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from servoscope.baseline.arm import PAYLOAD, ArmBaseline
+from servoscope.arm.baseline import PAYLOAD, ArmBaseline
+from servoscope.arm.log import ArmRecording, read_arm_log
+from servoscope.arm.model import ArmModel
+from servoscope.arm.regression import ArmSignals, block_information, filter_arm_log
+from servoscope.arm.settings import DEFAULT_CUTOFF, ArmLoop
+from servoscope.arm.urdf import Kinematics, parse_urdf
 from servoscope.core.arrays import FloatArray
 from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import LoopError, NotEnoughError, RecordingError
 from servoscope.core.messages import Message, message
 from servoscope.core.settings import read_toml_text
-from servoscope.estimation.arm_regression import ArmSignals, block_information, filter_arm_log
 from servoscope.fit.search import Experiment, fit
-from servoscope.models.arm.model import ArmModel
-from servoscope.models.arm.settings import DEFAULT_CUTOFF, ArmLoop
-from servoscope.models.arm.urdf import Kinematics, parse_urdf
 from servoscope.models.loop import Columns
 from servoscope.signals.readers import list_channels
-from servoscope.signals.readers.arm_log import ArmRecording, read_arm_log
 from servoscope.signals.readers.guess_columns import guess_mapping, quoted_channel
 from servoscope.signals.readers.recording_file import read_channels
 
