@@ -19,6 +19,8 @@ from pathlib import Path
 
 from tables import Table, parser, show
 
+from servoscope.cli.exit import RAN
+
 RIG = Path(str(files("servoscope"))) / "simulation" / "reference-rig.toml"
 
 
@@ -47,7 +49,9 @@ def run(command: list[str], cache_folder: str) -> tuple[float, float]:
     before, begin = used(), time.monotonic()
     start = [sys.executable, "-m", "servoscope", *command]
     environment = os.environ | {"NUMBA_CACHE_DIR": cache_folder}
-    subprocess.run(start, check=True, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    done = subprocess.run(start, check=False, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    if done.returncode not in RAN:
+        raise SystemExit(f"{' '.join(command)}: exit code {done.returncode}")
     return used() - before, time.monotonic() - begin
 
 

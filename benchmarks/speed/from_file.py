@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 from tables import Table, parser, show
 
 import servoscope as ss
+from servoscope.cli.exit import RAN
 from servoscope.simulation import reference
 from servoscope.simulation.closed_loop import LoopSimulation
 from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD
@@ -115,7 +116,7 @@ def _run(*words: str, **environment: str) -> tuple[float, float, int]:
     child = subprocess.Popen([sys.executable, *words], stdout=subprocess.DEVNULL, env=given | environment)
     _, status, used = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(status)
-    if child.returncode:
+    if child.returncode not in RAN:
         raise SystemExit(f"{' '.join(words)}: exit code {child.returncode}")
     memory = used.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
     return time.perf_counter() - begin, used.ru_utime + used.ru_stime, memory

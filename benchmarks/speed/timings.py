@@ -19,6 +19,7 @@ from accuracy.unknown import changed
 from tables import Table, parser, show
 
 import servoscope as ss
+from servoscope.cli.exit import RAN
 
 RIG = Path(str(files("servoscope"))) / "simulation" / "reference-rig.toml"
 REPEATS = 5
@@ -77,7 +78,9 @@ def figures(table: Table) -> dict[str, str]:
 
 
 def _python(*words: str) -> None:
-    subprocess.run([sys.executable, *words], check=True, stdout=subprocess.DEVNULL)
+    done = subprocess.run([sys.executable, *words], check=False, stdout=subprocess.DEVNULL)
+    if done.returncode not in RAN:
+        raise SystemExit(f"{' '.join(words)}: exit code {done.returncode}")
 
 
 def _servoscope(*words: str) -> None:

@@ -20,6 +20,7 @@ import pyarrow as pa
 import pyarrow.csv
 from tables import Table, parser, show
 
+from servoscope.cli.exit import RAN
 from servoscope.models.loop import Loop
 from servoscope.simulation import FaultEvent, reference, simulate
 
@@ -56,7 +57,7 @@ def run(*command: str, folder: Path) -> tuple[str, float, float, int]:
         _, status, usage = os.wait4(process.pid, 0)
         printed.seek(0)
         text = printed.read()
-    if status:
+    if os.waitstatus_to_exitcode(status) not in RAN:
         sys.exit(f"{' '.join(command)}: status {status}\n{text}")
     return text, time.perf_counter() - start, usage.ru_utime + usage.ru_stime, round(usage.ru_maxrss * 1024 / 1e6)
 

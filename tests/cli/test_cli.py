@@ -134,15 +134,15 @@ def test_learn_keeps_its_columns_in_the_baseline(made: Path, tmp_path: Path) -> 
     baseline = tmp_path / "b.json"
     assert run("learn", made / "loop.toml", tmp_path / "healthy.csv", "-o", baseline, *mapping).code == 0
     result = run("diagnose", baseline, tmp_path / "suspect.csv")
-    assert result.code == 0
+    assert result.code == 3
     assert "leakage has risen by a fifth" in result.out and "C_ie × 1.199" in result.out
-    assert run("diagnose", baseline, made / "suspect.csv", "--columns", "t=t, u=u").code == 0
+    assert run("diagnose", baseline, made / "suspect.csv", "--columns", "t=t, u=u").code == 3
 
 
 def test_diagnose_writes_json_report_and_trace(made: Path, tmp_path: Path) -> None:
     outputs = ("--report", tmp_path / "r.html", "--trace", tmp_path / "t.parquet")
     result = run("diagnose", made / "baseline.json", made / "suspect.csv", "--json", *outputs)
-    assert result.code == 0
+    assert result.code == 3
     said = json.loads(result.out)
     assert said["verdict"] == "fault"
     assert said["faults"][0]["name"] == "leakage"
@@ -177,19 +177,18 @@ def test_two_faults_at_once_are_told_with_why_and_beside_the_recursion(made: Pat
 def test_the_exit_code_says_what_happened(made: Path, tmp_path: Path) -> None:
     baseline, healthy, suspect = (made / name for name in ("baseline.json", "healthy.csv", "suspect.csv"))
     missing = tmp_path / "missing.csv"
-    assert run("diagnose", baseline, suspect).code == 0
-    assert run("diagnose", baseline, healthy, "--fail-on-fault").code == 0
-    assert run("diagnose", baseline, suspect, "--fail-on-fault").code == 3
-    assert run("diagnose", baseline, missing, "--fail-on-fault").code == 1
-    assert run("diagnose", baseline, missing, suspect, "--fail-on-fault").code == 3
-    assert run("diagnose", baseline, missing, suspect).code == 1
+    assert run("diagnose", baseline, suspect).code == 3
+    assert run("diagnose", baseline, suspect, "--fail-on-fault").code == 3, "as scripts for 1.0 call it"
+    assert run("diagnose", baseline, healthy).code == 0
+    assert run("diagnose", baseline, missing).code == 1
+    assert run("diagnose", baseline, missing, suspect).code == 3
     assert run("diagnose", baseline).code == 2
 
 
 def test_a_bad_file_does_not_stop_the_good_ones(made: Path, tmp_path: Path) -> None:
     paths = (tmp_path / "missing.csv", made / "healthy.csv", made / "suspect.csv")
     result = run("diagnose", made / "baseline.json", *paths, "--json")
-    one_line(result, "missing.csv")
+    assert result.code == 3 and "missing.csv" in result.err and len(result.err.splitlines()) == 1
     said = [json.loads(line) for line in result.out.splitlines()]
     assert [(each["recording"], each["verdict"]) for each in said] == [
         ("healthy.csv", "healthy"),
@@ -239,7 +238,7 @@ def process(*words: object, **settings: Any) -> subprocess.Popen[str]:
 
 
 def test_the_real_command_prints_pure_json(made: Path) -> None:
-    done = process("diagnose", made / "baseline.json", made / "suspect.csv", "--json", "--fail-on-fault")
+    done = process("diagnose", made / "baseline.json", made / "suspect.csv", "--json")
     out, err = done.communicate()
     assert done.returncode == 3
     assert err == ""

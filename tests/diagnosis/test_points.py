@@ -223,7 +223,7 @@ def test_the_command_line_learns_points_and_judges_at_one(folder: Path, tmp_path
     assert run("learn", folder / "loop.toml", odd, "-o", tmp_path / "plain.json").code == 0
     assert ss.Baseline.load(tmp_path / "plain.json").points == ()
     assert "Healthy at warm" in run("diagnose", at, folder / "warm.csv").out
-    judged = run("diagnose", at, folder / "warm.csv", "--point", "cold", "--fail-on-fault")
+    judged = run("diagnose", at, folder / "warm.csv", "--point", "cold")
     assert judged.code == 3 and "Fault at cold: leakage" in judged.out
     one_line(run("diagnose", at, folder / "a.csv", "--point", "hot"), "'hot'", "cold, warm")
     mixed = run("learn", folder / "loop.toml", folder / "a.csv", f"warm={folder / 'warm.csv'}", "-o", at)

@@ -48,7 +48,7 @@ def files(baseline: ss.Baseline, tmp_path: Path) -> tuple[Path, Path, Path]:
     write_recording(tmp_path / "run.csv", recording(7, gain=1.3))
     baseline.save(tmp_path / "baseline.json")
     found = CliRunner().invoke(app, ["diagnose", str(tmp_path / "baseline.json"), str(tmp_path / "run.csv"), "--json"])
-    assert found.exit_code == 0, found.output
+    assert found.exit_code == 3, found.output
     (tmp_path / "diagnosis.json").write_text(found.stdout, encoding="utf-8")
     return tmp_path / "diagnosis.json", tmp_path / "run.csv", tmp_path / "baseline.json"
 

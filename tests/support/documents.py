@@ -21,6 +21,8 @@ from typing import Any
 
 from commands import run
 
+from servoscope.cli.exit import RAN
+
 BLOCK = re.compile(r"(?:^ *`(?P<file>[\w.-]+)`:\n\n)?^ *```(?P<kind>\w*)\n(?P<text>.*?)^ *```$", re.M | re.S)
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
@@ -82,5 +84,5 @@ def _run(words: list[str], where: str) -> str:
         return ""
     assert words[0] == "servoscope", f"{where}: {words[0]} is no command that a page may run"
     done = run(*words[1:])
-    assert done.code == 0, f"{where}: {' '.join(words)}: {done.err}"
+    assert done.code in RAN, f"{where}: {' '.join(words)}: {done.err}"
     return done.out

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servoscope.cli.app import app
-from servoscope.cli.exit import EXIT_FAULT, FailureCounter, print_json
+from servoscope.cli.exit import FailureCounter, exit_after, print_json
 from servoscope.cli.output_paths import OutputPaths, check_output
 from servoscope.core.errors import BaselineError, OutputError
 from servoscope.core.files import atomic_write
@@ -18,6 +18,7 @@ from servoscope.core.messages import render, say
 
 if TYPE_CHECKING:
     from servoscope.arm.baseline import ArmBaseline
+    from servoscope.core.verdict import VerdictKind
 
 
 def refuse_options(options: Mapping[str, object]) -> None:
@@ -122,7 +123,7 @@ def _print_baseline(baseline: ArmBaseline) -> None:
 
 
 def diagnose_logs(
-    baseline: ArmBaseline, logs: Sequence[Path], as_json: bool, report: Path | None, fail_on_fault: bool, details: bool
+    baseline: ArmBaseline, logs: Sequence[Path], as_json: bool, report: Path | None, details: bool
 ) -> None:
     """Diagnose logs of an arm, print the verdicts, and write reports on them."""
     from servoscope.arm.diagnosis import examine_arm
@@ -131,12 +132,13 @@ def diagnose_logs(
     from servoscope.report import document, plain_values
 
     pages = OutputPaths.from_option(report, ".html", len(logs) > 1, logs)
-    failures, faulty = FailureCounter(), False
+    failures = FailureCounter()
+    verdicts: list[VerdictKind] = []
     for path in logs:
         with failures.catch():
             recording = read_arm_log(path, baseline.loop, baseline.model.arm)
             result, examination = examine_arm(baseline, recording)
-            faulty |= result.verdict == "fault"
+            verdicts.append(result.verdict)
             if as_json:
                 print_json(plain_values.to_plain_values(result), lines=len(logs) > 1)
             else:
@@ -147,6 +149,5 @@ def diagnose_logs(
                 from servoscope.arm.page import write_arm_page  # late: it draws
 
                 pages.write(path, recording.name, write_arm_page, result, examination, baseline, stderr=as_json)
-    if fail_on_fault and faulty:
-        raise typer.Exit(EXIT_FAULT)
+    exit_after(verdicts)
     failures.exit_if_any()

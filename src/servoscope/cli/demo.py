@@ -15,6 +15,7 @@ from pathlib import Path
 import typer
 from rich.text import Text
 
+from servoscope.cli.exit import RAN
 from servoscope.core.files import atomic_write, make_folder
 
 WIDTH = 80
@@ -120,5 +121,5 @@ def _format_command(step: DemoStep) -> str:
 
 
 def _exit_on_failure(code: object) -> None:
-    if code:  # the command has printed the reason
+    if (code or 0) not in RAN:  # the command has printed the reason
         raise typer.Exit(int(str(code)))

@@ -7,7 +7,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import requires
 from typing import Any
@@ -19,6 +19,7 @@ from servoscope.core.errors import ServoscopeError
 from servoscope.core.messages import say
 
 EXIT_INPUT, EXIT_FAULT, EXIT_SUSPECT, EXIT_INTERRUPTED = 1, 3, 4, 130  # exit codes; 2 is the command line's
+RAN = (0, EXIT_FAULT, EXIT_SUSPECT)  # codes of commands that did all that they were asked for
 
 
 def find_extra(module: str) -> str | None:
@@ -90,6 +91,14 @@ class FailureCounter:
         """End the command with exit code 1 if there was any failure."""
         if self.count:
             raise typer.Exit(EXIT_INPUT)
+
+
+def exit_after(verdicts: Sequence[str]) -> None:
+    """End the command with the exit code of the worst verdict, if one is a fault or suspect."""
+    if "fault" in verdicts:
+        raise typer.Exit(EXIT_FAULT)
+    if "suspect" in verdicts:
+        raise typer.Exit(EXIT_SUSPECT)
 
 
 def print_error(what: object) -> None:
