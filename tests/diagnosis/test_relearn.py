@@ -104,6 +104,27 @@ def test_a_recording_that_is_gone_is_named(folder: Path) -> None:
     assert any("1.csv" in str(note) for note in preview.notes) and ss.Baseline.load(path).revision.number == 1
 
 
+def test_recordings_that_are_long_together_are_found_again(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Week after week, also for a baseline of 1.0, which kept the samples that it learned from; not another file."""
+    for module in ("operating_points", "relearn"):
+        monkeypatch.setattr(f"servoscope.diagnosis.{module}.MAX_SAMPLES", 6_000)
+    path = folder / "baseline.json"
+    for week in range(2):
+        write_recording(folder / f"week-{week}.csv", axis(20 + week))
+        baseline = ss.relearn(path, [folder / f"week-{week}.csv"])
+    assert [source.name for source in baseline.sources][3:] == [f"week-{week}.csv" for week in range(2)]
+    assert all(source.samples == axis(0).samples and source.hash for source in baseline.sources)
+    old = json.loads(path.read_text())
+    for source in old["sources"]:
+        del source["hash"]
+        source["samples"] = 6_000 // len(old["sources"])
+    path.write_text(json.dumps(old))
+    write_recording(folder / "late.csv", axis(30))
+    assert len(ss.relearn(path, [folder / "late.csv"]).sources) == 6
+    write_recording(folder / "0.csv", axis(31))
+    one_line(run("learn", "--add", folder / "3.csv", "-b", path), "0.csv", "put it there")
+
+
 def test_options_that_do_not_go_together_are_refused(folder: Path) -> None:
     path = folder / "baseline.json"
     assert run("learn", "--add", folder / "3.csv").code == 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import operator
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, Self, TypeVar
 
@@ -17,6 +18,7 @@ from servoscope.estimation.noise_model import ArmaNoise, WhiteNoise
 from servoscope.estimation.pipeline import Tuning
 from servoscope.estimation.two_stage import StageOneTuning
 from servoscope.models.loop import Loop
+from servoscope.signals.recording import Recording
 
 Value = TypeVar("Value")
 Vector = tuple[float, ...]
@@ -67,11 +69,26 @@ class BaselineMemory(BaselineModel):
 
 
 class BaselineSource(BaselineModel):
-    """A recording that the baseline was learned from."""
+    """A recording that the baseline was learned from, as it was before stretches of it were taken."""
 
     name: str
     samples: int
     duration_s: float
+    hash: str = Field(default="", exclude_if=operator.not_)  # of u and y; baselines of 1.0 have none
+
+    @classmethod
+    def from_recording(cls, recording: Recording) -> Self:
+        """Describe a recording so that it is known again."""
+        return cls(
+            name=recording.name,
+            samples=recording.samples,
+            duration_s=recording.duration_s,
+            hash=hash_arrays(recording.u, recording.y),
+        )
+
+    def fits(self, recording: Recording) -> bool:
+        """Tell whether this is the recording, not another of its name."""
+        return self.samples == recording.samples and self.hash in ("", hash_arrays(recording.u, recording.y))
 
 
 Occasion = Literal["repair", "tool", "product", "season"]
@@ -190,7 +207,12 @@ def parse_stored_loop(settings: Mapping[str, Any]) -> Loop:
 
 def digest(loop: Loop, arrays: list[FloatArray]) -> str:
     """Return a hash of a loop and of all samples that were learned from: 16 hexadecimal digits."""
-    h = hashlib.sha256(loop.hash().encode())
+    return hash_arrays(*arrays, start=loop.hash())
+
+
+def hash_arrays(*arrays: FloatArray, start: str = "") -> str:
+    """Return a hash of a text and of arrays, bit by bit: 16 hexadecimal digits."""
+    h = hashlib.sha256(start.encode())
     for array in arrays:
         h.update(np.ascontiguousarray(array).tobytes())
     return h.hexdigest()[:16]

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from servoscope.baseline.baseline import Baseline
+from servoscope.baseline.records import BaselineSource
 from servoscope.core.errors import BaselineError, NotEnoughError
 from servoscope.core.messages import Message, message
 from servoscope.core.verdict import FOUND
@@ -142,7 +143,11 @@ def learn(
         whole_notes = _judge_whole(baseline, whole, some)
         alike = [note for other in learned if (note := _resemblance_note(other, name, longest)) is not None]
         baseline = baseline.model_copy(
-            update={"point": name, "notes": (*odd, *baseline.notes, *notes[name], *whole_notes, *alike)}
+            update={
+                "point": name,
+                "sources": _whole_sources(baseline, whole, some),
+                "notes": (*odd, *baseline.notes, *notes[name], *whole_notes, *alike),
+            }
         )
         learned.append(
             learn_faults.add_learned_faults(baseline, labels[name], progress) if name in labels else baseline
@@ -159,6 +164,21 @@ def _thin_out(loop: Loop, recordings: Sequence[Recording]) -> list[Recording]:
     memories = math.inf if loop.monitor.hidden_warm_up else MIN_MEMORIES
     shortest = round(min(memories * loop.monitor.memory * loop.sample_rate, MAX_SAMPLES))
     return [thin_out(rec, math.ceil(MAX_SAMPLES / samples * rec.samples), shortest) for rec in recordings]
+
+
+def _whole_sources(
+    baseline: Baseline, whole: Sequence[Recording], learned: Sequence[Recording]
+) -> tuple[BaselineSource, ...]:
+    """Return the recordings of a baseline as their files have them; those with a defect are not among them."""
+    pairs = iter(zip(whole, learned, strict=True))
+    return tuple(
+        next(
+            BaselineSource.from_recording(rec)
+            for rec, part in pairs
+            if (part.name, part.samples) == (source.name, source.samples)
+        )
+        for source in baseline.sources
+    )
 
 
 def _judge_whole(baseline: Baseline, whole: Sequence[Recording], learned: Sequence[Recording]) -> list[Message]:

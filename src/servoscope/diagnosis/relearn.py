@@ -11,7 +11,7 @@ from servoscope.baseline.history import history_folder, read_history, replace_ba
 from servoscope.baseline.records import RENEWALS, Occasion, Revision
 from servoscope.core.errors import BaselineError
 from servoscope.core.messages import Message, message
-from servoscope.diagnosis.operating_points import compare_with_earlier, learn
+from servoscope.diagnosis.operating_points import MAX_SAMPLES, compare_with_earlier, learn
 from servoscope.learning.learn import Progress
 from servoscope.signals import Recording, readers
 from servoscope.signals.readers import as_recording
@@ -148,15 +148,18 @@ def _earlier_recordings(
 def find_sources(baseline: Baseline, folders: Sequence[Path]) -> tuple[list[Recording], list[str]]:
     """Return the recordings that a baseline was learned from, and the names of those that are in none of the folders.
 
-    A file of another number of samples is another recording. Samples that a service kept have their own columns.
+    A file of another number of samples, or of other samples, is another recording. Samples that a service kept have
+    their own columns.
     """
     loop, recordings, missing = baseline.loop, list[Recording](), list[str]()
+    # baselines of 1.0 have no hashes, and of recordings that were long together the samples that were learned from
+    shortened = sum(source.samples for source in baseline.sources) > 0.9 * MAX_SAMPLES
     own = plain_columns(loop.columns.covariates)
     for source in baseline.sources:
         files = [folder / source.name for folder in folders if (folder / source.name).is_file()]
         for file in files:
             recording = readers.read(file, loop, columns=own if file.parent.suffix == ".history" else None)
-            if recording.samples == source.samples:
+            if source.fits(recording) or (shortened and not source.hash and recording.samples > source.samples):
                 recordings.append(recording)
                 break
         else:
