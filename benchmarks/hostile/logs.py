@@ -3,7 +3,7 @@
     python benchmarks hostile/logs [--seed 1] [--logs 1000] [--loops 2000]
 
 Each answer is a result or an error of one line; a traceback, an error of several lines and more than 20 s of processor
-time are printed, and counted. The program ends with 1 where there is one.
+time are printed, and counted. The program ends with 1 where there is one; Ctrl-C ends it with what was tried so far.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -29,6 +30,7 @@ from servoscope.simulation import simulate
 
 MAX_S = 20.0  # of processor time for one command
 MAX_SHOWN = 10  # tracebacks
+LONGEST_S = 20.0  # of a log; the shortest is a quarter of it
 Generator = np.random.Generator
 Log = dict[str, FloatArray]
 
@@ -46,6 +48,8 @@ PLANTS: tuple[dict[str, Any], ...] = (
 class Count:
     """What came of the commands."""
 
+    logs: int = 0
+    loops: int = 0
     answers: Counter[str] = field(default_factory=Counter)
     broken: list[str] = field(default_factory=list)
     slowest_s: float = 0.0
@@ -73,9 +77,10 @@ class Count:
         return answer
 
 
-def healthy_log(rng: Generator, seconds: float) -> Log:
-    """Draw a log of a simulated axis: rate, motion, friction, units and resolution."""
-    rate = float(rng.choice([20.0, 50.0, 100.0, 250.0]))
+def healthy_log(rng: Generator, longest_s: float) -> Log:
+    """Draw a log of a simulated axis: length, rate, motion, friction, units and resolution."""
+    seconds = rng.uniform(0.25 * longest_s, longest_s)
+    rate = float(rng.choice([50.0, 100.0, 200.0]))
     inertia, viscous, coulomb = rng.uniform([0.5, 1.0, 0.0], [3.0, 10.0, 4.0]).tolist()
     coefficients = {"inertia": inertia, "viscous_friction": viscous, "coulomb_friction": coulomb}
     loop = ss.Loop.from_dict({
@@ -136,9 +141,9 @@ def spoiled(rng: Generator, log: Log) -> tuple[str, Log]:
     return f"{name} {way}", log | dict(ways[way]())
 
 
-def try_log(count: Count, rng: Generator, words: str, seconds: float) -> None:
+def try_log(count: Count, rng: Generator, words: str, longest_s: float) -> None:
     """Put a log, in which up to two things are wrong, through all commands."""
-    good, wrong = healthy_log(rng, seconds), []
+    good, wrong = healthy_log(rng, longest_s), []
     bad = good
     for _ in range(int(rng.integers(1, 3))):
         what, bad = spoiled(rng, bad)
@@ -194,16 +199,16 @@ def try_loop(count: Count, rng: Generator, words: str, log: Log) -> None:
             count.run(f"diagnose {words}", lambda: ss.diagnose(learned, ss.read(log, loop)))
 
 
-def try_all(seed: int, logs: int, loops: int, seconds: float = 20.0) -> Count:
+def try_all(count: Count, seed: int, logs: int, loops: int, longest_s: float = LONGEST_S) -> None:
     """Draw logs and loop files; those of one seed are the same however many are drawn."""
-    count = Count()
     for i in range(logs):
-        try_log(count, np.random.default_rng([seed, 0, i]), f"log {i}", seconds)
-    log = healthy_log(np.random.default_rng([seed, 1]), seconds)
+        try_log(count, np.random.default_rng([seed, 0, i]), f"log {i}", longest_s)
+        count.logs += 1
+    log = healthy_log(np.random.default_rng([seed, 1]), longest_s)
     log["t"] = np.arange(len(log["t"])) / 100.0
     for i in range(loops):
         try_loop(count, np.random.default_rng([seed, 2, i]), f"file {i}", log)
-    return count
+        count.loops += 1
 
 
 def main() -> None:
@@ -212,9 +217,11 @@ def main() -> None:
     command.add_argument("--seed", type=int, default=1)
     command.add_argument("--logs", type=int, default=1000)
     command.add_argument("--loops", type=int, default=2000)
-    command.add_argument("--seconds", type=float, default=20.0, help="of a log")
     given = command.parse_args()
-    count = try_all(given.seed, given.logs, given.loops, given.seconds)
+    count = Count()
+    with suppress(KeyboardInterrupt):
+        try_all(count, given.seed, given.logs, given.loops)
+    print(f"{count.logs} logs and {count.loops} loop files of seed {given.seed}")
     for words, times in sorted(count.answers.items()):
         print(f"{words} {times}")
     print(f"{len(count.broken)} broken, the slowest command took {count.slowest_s:.1f} s of processor time")

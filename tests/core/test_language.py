@@ -250,7 +250,7 @@ def test_the_terminal_is_german(tmp_path: Path) -> None:
         FOLDER / "suspect.parquet",
     ]
     done = subprocess.run(argv, capture_output=True, text=True, cwd=tmp_path, check=False)
-    assert done.returncode == 0 and done.stdout.index("zu prüfen") < done.stdout.index(
+    assert done.returncode == 3 and done.stdout.index("zu prüfen") < done.stdout.index(
         "95-%-Intervall"
     ) < done.stdout.index("Warum")
     assert re.findall(ENGLISH, done.stdout) == [], done.stdout

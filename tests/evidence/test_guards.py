@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hostile.logs import try_all
+from hostile.logs import Count, try_all
 
 import servoscope as ss
 from servoscope.core.arrays import FloatArray
@@ -146,6 +146,7 @@ def test_a_huge_spike_is_dropped_at_a_step_of_the_reference_too(baseline: ss.Bas
 
 
 def test_logs_and_loop_files_as_nobody_wants_them_are_refused_in_one_line() -> None:
-    count = try_all(seed=5, logs=10, loops=40, seconds=2.0)
+    count = Count()
+    try_all(count, seed=5, logs=10, loops=40, longest_s=4.0)
     assert count.broken == []
     assert sum(count.answers.values()) > 70

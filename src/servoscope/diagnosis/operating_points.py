@@ -20,6 +20,7 @@ from servoscope.diagnosis.diagnose import diagnose
 from servoscope.diagnosis.learn_faults import LabelledRecordings
 from servoscope.evidence.population import MIN_MACHINES, Population
 from servoscope.learning import learn as learning
+from servoscope.learning.hold import with_likelier_hold
 from servoscope.learning.learn import Progress
 from servoscope.learning.plausibility import check_plausibility, check_wraps
 from servoscope.models.loop import Loop
@@ -126,6 +127,7 @@ def learn(
         raise NotEnoughError("no recording to learn from: give at least one healthy recording")
     labels = _group_by_point(faults or {}, recordings)
     notes = {name: compare_with_earlier(compare, name, some, progress, accept_change) for name, some in named.items()}
+    loop, hold_notes = with_likelier_hold(loop, [recording for some in named.values() for recording in some])
     learned: list[Baseline] = []
     alikes = _named_machines(population)
     if len(alikes) < MIN_MACHINES:
@@ -146,7 +148,7 @@ def learn(
             update={
                 "point": name,
                 "sources": _whole_sources(baseline, whole, some),
-                "notes": (*odd, *baseline.notes, *notes[name], *whole_notes, *alike),
+                "notes": (*odd, *hold_notes, *baseline.notes, *notes[name], *whole_notes, *alike),
             }
         )
         learned.append(

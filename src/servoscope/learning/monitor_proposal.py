@@ -10,9 +10,10 @@ import numpy as np
 from servoscope.core import number_format
 from servoscope.core.errors import NotEnoughError
 from servoscope.core.messages import message
+from servoscope.learning.hold import LikelierHold
 from servoscope.learning.inspection import Inspection
 from servoscope.learning.inspection.rules import MIN_MEMORIES, advised_rest_speed
-from servoscope.learning.loop_proposal import ProposalLine
+from servoscope.learning.loop_proposal import ProposalLine, quoted
 from servoscope.learning.plant_proposal import why_not_learned
 from servoscope.models.loop import Loop, MonitorSettings
 from servoscope.signals import Recording
@@ -39,6 +40,13 @@ def monitor_lines(monitor: Mapping[str, object], duration_s: float) -> list[Prop
         ProposalLine("monitor", key, repr(monitor[key]), message(f"init.{key}", **values))
         for key, values in reasons.items()
     ]
+
+
+def hold_lines(likelier: LikelierHold | None) -> list[ProposalLine]:
+    """Return the line on how u runs between the samples, where the logs show it."""
+    if likelier is None:
+        return []
+    return [ProposalLine("", "hold", quoted(likelier.hold), message(f"init.hold_{likelier.hold}", gain=likelier.gain))]
 
 
 def hold_at_rest(

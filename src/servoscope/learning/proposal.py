@@ -16,10 +16,11 @@ from pydantic import ValidationError
 from servoscope.core.errors import IrregularTimeError, LoopError, NotEnoughError, RecordingError, ServoscopeError
 from servoscope.core.messages import Message, message
 from servoscope.core.settings_errors import describe_error
+from servoscope.learning.hold import likelier_hold
 from servoscope.learning.inspection import Inspection, inspect
 from servoscope.learning.inspection.cutoff import measure_cutoff
 from servoscope.learning.loop_proposal import LoopProposal, ProposalLine, quoted
-from servoscope.learning.monitor_proposal import hold_at_rest, monitor_lines, monitor_settings
+from servoscope.learning.monitor_proposal import hold_at_rest, hold_lines, monitor_lines, monitor_settings
 from servoscope.learning.plant_choice import PlantCandidate, choose_plant
 from servoscope.learning.plant_proposal import (
     choose_learnable,
@@ -140,12 +141,16 @@ def propose_loop(
     chosen = with_pressures(chosen, path, columns)
     if odd is not None:
         settings["implausible"] = "note"
+    hold = likelier_hold(loop_of(chosen.settings), recordings)
+    if hold is not None:
+        settings["hold"] = hold.hold
     inspected = inspect(recording, loop_of(chosen.settings))
     held = hold_at_rest(inspected, monitor, lambda: loop_of(chosen.settings), recordings)
     loop = loop_of(chosen.settings)
     further, told = _further_columns(path, columns, where, max(round(loop.monitor.memory * loop.sample_rate), 1))
     lines = (
         ProposalLine("", "sample_rate", repr(loop.sample_rate), message("init.rate", samples=recording.samples)),
+        *hold_lines(hold),
         *([] if odd is None else [ProposalLine("", "implausible", '"note"', message("init.odd", reason=odd), True)]),
         *_column_lines(path, columns, wraps, recording),
         *further,
