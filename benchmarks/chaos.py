@@ -1,6 +1,7 @@
 """Publisher, broker, OPC UA servers, database and service, killed at random, cables pulled, a clock that jumps.
 
     python benchmarks/chaos.py [sqlite|postgresql] [--hours 1] [--assets 200] [--speed 1] [--block 1]
+    python benchmarks/chaos.py simulated [--seed 1] [--steps 500] [--minutes 4]
     python benchmarks/chaos.py --render
 
 The assets are sent by `servoscope publish`. One more, `plain`, has a sender that keeps nothing and whose clock jumps,
@@ -40,6 +41,7 @@ from reliability.plc import SENDER, STACKS, Plc  # noqa: E402
 from reliability.servers import Cable, Mosquitto, Postgres, mosquitto, programs  # noqa: E402
 from reliability.trial import CALM_S, Latencies, quantile  # noqa: E402
 from reliability.workplace import free_port  # noqa: E402
+from simulated.command import main as simulated  # noqa: E402
 from soak import PAGE, RESULTS, TRIALS  # noqa: E402
 from tables import machine  # noqa: E402
 
@@ -326,14 +328,13 @@ def column(one: dict[str, Any]) -> list[tuple[str, str]]:
         for what, words in EVENTS.items()
         for times in [one["happened"].get(what, [])]
     ]
-    wrong = f"{one['lost']}, {one['doubled']}, {one['other']}"
     rows = [
         ("simulated", f"{size}, {settings['speed']:g} times true speed, in {one['seconds']:.0f} s"),
         *happened,
         ("latency undisturbed, p50 and p99", f"{latency['p50']:.2g} s, {latency['p99']:.2g} s"),
         ("memory of the service, at most", f"{one['largest_mb']:.0f} MB"),
         ("blocks sent by `servoscope publish`", f"{one['blocks']}"),
-        ("of them lost, counted twice; assets with other samples", wrong),
+        ("of them lost, counted twice; assets with other samples", f"{one['lost']}, {one['doubled']}, {one['other']}"),
         ("assets whose rows are not numbered through", f"{one['misnumbered']}"),
         ("sent once more and left out", f"{one['left out as repeated']}"),
         *((f"people: {name}", f"{count}") for name, count in one.get("people", {}).items()),
@@ -372,6 +373,8 @@ def render() -> None:
 
 def main() -> None:
     """Run the command line of this process."""
+    if sys.argv[1:2] == ["simulated"]:
+        sys.exit(simulated(sys.argv[2:]) > 0)
     command = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     command.add_argument("store", nargs="?", choices=TRIALS, default="sqlite", help="where the service stores")
     command.add_argument("--hours", type=float, default=1.0, help="simulated hours")
@@ -379,9 +382,7 @@ def main() -> None:
     command.add_argument("--speed", type=float, default=1.0, help="times true speed")
     command.add_argument("--block", type=float, default=1.0, help="length of a block, in s")
     command.add_argument("--every", type=float, default=20.0, help="mean time between disturbances, in s")
-    command.add_argument(
-        "--render", action="store_true", help="write the table into benchmarks/reliability/RESULTS.md, and no more"
-    )
+    command.add_argument("--render", action="store_true", help="write the table into reliability/RESULTS.md only")
     given = command.parse_args()
     if given.render:
         render()

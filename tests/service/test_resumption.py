@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import halls
+import numpy as np
 import pytest
 import sqlalchemy as sa
 from commands import one_line, run
@@ -18,10 +19,31 @@ from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.history import history_folder, restore_parent
 from servoscope.baseline.records import Revision
 from servoscope.core.errors import BaselineError
+from servoscope.diagnosis.monitor import Monitor
 from servoscope.service import baselines, renewal
+from servoscope.service.assets.asset import Asset
 from servoscope.service.config import ServiceFile
+from servoscope.service.sources.block import Block
 from servoscope.service.store import Store, tables
 from servoscope.service.store.series import read_notes
+
+
+def test_a_new_state_owes_the_rows_of_diagnoses_under_way_and_keeps_alarms_that_stand() -> None:
+    monitor, leaky = Monitor(halls.baseline()), halls.recorded(2, halls.LEAK)
+    asset, renewed_asset = (Asset("press", monitor.baselines[0], monitor, halls.POLICY) for _ in range(2))
+    for k in range(120):
+        rows = slice(50 * k, 50 * k + 50)
+        t = halls.BEGAN + np.arange(6000)[rows] / 100.0
+        asset.process(Block("press", k, t, leaky.r[rows], leaky.u[rows], leaky.y[rows]))
+        if asset.pending_diagnoses and asset.take_state().alarms["fault"].sequence:
+            break
+    before = asset.take_state()
+    (window,) = before.pending_diagnoses
+    (owed,) = renewed_asset.begin(before.position, before)
+    assert owed.table == "diagnoses" and owed.values["number"] == window.number
+    assert owed.values["verdict"] == "undetermined" and "new state" in owed.values["summary"]
+    after = renewed_asset.take_state()
+    assert after.alarms["fault"].state == "unacknowledged" and not after.pending_diagnoses
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,7 @@ from servoscope.service.assets.asset import Asset, AssetPolicy
 from servoscope.service.assets.examination import compile_examination
 from servoscope.service.assets.groups import AssetGroups
 from servoscope.service.assets.outlook import AssetLimits
+from servoscope.service.assets.records import TableRow
 from servoscope.service.config import ServiceFile
 from servoscope.service.notifications import Notifier
 from servoscope.service.publishers.base import StatusPublisher
@@ -41,7 +42,8 @@ class ServiceComponents:
     sources: dict[str, Inbox]
     publishers: dict[str, StatusPublisher]
     store: Store
-    restarted: tuple[str, ...] = ()  # those that begin with a new state
+    # those that begin with a new state, and the rows that the one before owes
+    restarted: Mapping[str, list[TableRow]] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)  # assets that cannot be followed, and why
 
 
@@ -80,7 +82,7 @@ def build_components(config: ServiceFile, restarted: Collection[str] = ()) -> Se
         store.close()
         raise
     if config.name in restarted:
-        anew = (*anew, config.name)
+        anew[config.name] = []
     return ServiceComponents(assets, groups, notifier, sources, publishers, store, anew, left_out)
 
 

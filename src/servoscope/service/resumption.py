@@ -16,6 +16,7 @@ from servoscope.service.assets.asset import Asset
 from servoscope.service.assets.checkpoint import AssetState, StreamPosition, unpack_state
 from servoscope.service.assets.groups import AssetGroups
 from servoscope.service.assets.reception import UNHEARD_RECEPTION
+from servoscope.service.assets.records import TableRow
 from servoscope.service.clock import LayerTimes
 from servoscope.service.config import ServiceFile
 from servoscope.service.log import log
@@ -28,7 +29,7 @@ class Resumption(NamedTuple):
 
     assets: dict[str, Asset]  # those that are followed
     groups: AssetGroups  # of these
-    restarted: tuple[str, ...]  # those that begin with a new state
+    restarted: dict[str, list[TableRow]]  # those that begin with a new state, and the rows that the one before owes
     left_out: dict[str, str]  # the others, and why
 
 
@@ -47,17 +48,17 @@ def resume_assets(
     the others do not wait for it. `running`: those of `assets` that go on as they are.
     """
     uncounted, behind = list[Block](), set[str]()  # behind: assets of which the store may know more than their states
-    anew, left_out = list[str](), dict[str, str]()
+    anew, left_out = dict[str, list[TableRow]](), dict[str, str]()
     new = [name for name in assets if running is None or assets[name] is not running.get(name)]
     stored = store.recent_samples_of([name for name in new if name in rows])
     for name, samples in chain(stored, ((name, []) for name in new if name not in rows)):
         asset, blocks = assets[name], [Block.unpack(name, *sample) for sample in samples]
         try:
-            state = None if name in restarted or name not in rows else unpack_state(rows[name]["state"], name)
+            state = None if name not in rows else _read_state(rows[name], name, may_be_torn=name in restarted)
             if name in restarted or (state is not None and _is_renewed(config, asset, state, running)):
-                anew.append(name)
+                anew[name] = []
                 if name in rows:
-                    asset.begin(_counted(StreamPosition(**rows[name]["status"]["counted"]), blocks))
+                    anew[name] = asset.begin(_counted(StreamPosition(**rows[name]["status"]["counted"]), blocks), state)
                     behind.add(name)
             elif state is not None:
                 left = asset.resume(state, blocks)
@@ -76,7 +77,17 @@ def resume_assets(
     deque(groups.process(uncounted), maxlen=0)
     for name, number in store.last_residuals(behind).items():
         assets[name].count_rows(number)
-    return Resumption(followed, groups, tuple(name for name in assets if name in anew), left_out)
+    return Resumption(followed, groups, {name: anew[name] for name in assets if name in anew}, left_out)
+
+
+def _read_state(row: Row, asset: str, *, may_be_torn: bool) -> AssetState | None:
+    """Return the state of an asset in its row; raises StateError if it cannot be used, unless it `may_be_torn`."""
+    try:
+        return unpack_state(row["state"], asset)
+    except StateError:
+        if not may_be_torn:
+            raise
+    return None
 
 
 def _counted(position: StreamPosition, blocks: list[Block]) -> StreamPosition:

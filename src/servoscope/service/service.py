@@ -89,7 +89,7 @@ class Service(ServiceParts):
             announce()
             notify_systemd("READY=1", self._systemd_status)
             while not self._stopping and not self._ended:
-                if self._reload_from is not None:
+                if self._reload_from is not None and self.writer.unavailable_since is None:
                     path, self._reload_from = self._reload_from, None
                     self._reload(path)
                 self._run_once()
@@ -107,8 +107,8 @@ class Service(ServiceParts):
 
     def _add_restarts(self, components: ServiceComponents) -> None:
         """Write new states at once: if no block comes, the next start must not find the torn or old one."""
-        for name in components.restarted:
-            self.writer.add(name, [audit_row("began anew", {})])
+        for name, owed in components.restarted.items():
+            self.writer.add(name, [audit_row("began anew", {}), *owed])
             if name in components.assets:
                 self.writer.set_checkpoint(components.assets[name])
 
@@ -122,6 +122,10 @@ class Service(ServiceParts):
         try:
             config = self.config.load_again(path)
             components, changes = reload_components(config, self.config, self._components, self._commit_all)
+        except StoreUnavailableError as error:  # what asked for it may be done by now: it is not asked for again
+            self._reload_from = path
+            log("warning", "reload waits for the store", why=str(error))
+            return
         except ServoscopeError as error:
             log("error", "reload refused", why=str(error))
             self.writer.add(self.config.name, [audit_row("reload refused", {"why": str(error)})])

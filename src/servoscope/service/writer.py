@@ -48,7 +48,7 @@ class StoreWriter:
         self._gathered = PendingCommit()
         self._sealed: PendingCommit | None = None  # on its way: nothing is added to it any more
         self._checkpoints: dict[str, Asset] = {}  # whose states are to be written as they are then
-        self._urgent: set[str] = set()  # assets whose checkpoint cannot wait
+        self._urgent: dict[str, None] = {}  # assets whose checkpoint cannot wait, in order
         self._in_doubt = False
         self._retry_s = self._retry_at = 0.0
         self.unavailable_since: float | None = None  # [UTC s]
@@ -106,7 +106,7 @@ class StoreWriter:
             return
         self._checkpoints[asset.name] = asset
         if not can_wait:
-            self._urgent.add(asset.name)
+            self._urgent[asset.name] = None
 
     def set_checkpoints(self, assets: Iterable[Asset], completed_at: Iterable[float]) -> None:
         """Take the states of assets after a block of each, as `set_checkpoint` does; they can wait."""
@@ -117,7 +117,7 @@ class StoreWriter:
 
     def finish(self) -> None:
         """Let no checkpoint wait any longer: nothing follows."""
-        self._urgent |= self._checkpoints.keys()
+        self._urgent |= dict.fromkeys(self._checkpoints)
 
     def add_checkpoint(self, row: Mapping[str, Any]) -> None:
         """Take a checkpoint that is no asset's."""
@@ -162,7 +162,7 @@ class StoreWriter:
                 "status": asset.status(state),
                 "at": time.time(),
             }
-        self._urgent = set()
+        self._urgent = {}
         batch.bundles = self._bundles.advance(self._gathered.samples, batch.first_needed)
         self._gathered.samples = []
         return self._gathered

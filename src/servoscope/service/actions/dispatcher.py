@@ -81,7 +81,7 @@ class OutboxDispatcher:
             }
             new = {identity: entry for identity, entry in due.items() if identity not in self._in_progress}
             self._in_progress |= {identity: entry.sink for identity, entry in new.items()}
-            for sink in {entry.sink for entry in new.values()}:
+            for sink in dict.fromkeys(entry.sink for entry in new.values()):
                 self._busy.add(sink)
                 job = sink, [entry for entry in new.values() if entry.sink == sink]
                 threading.Thread(target=self._deliver, args=job, name=f"delivery to {sink}", daemon=True).start()

@@ -18,7 +18,7 @@ from servoscope.service.assets.examination_schedule import (
     schedule_full_diagnosis,
     update_examination,
 )
-from servoscope.service.assets.records import NextBlock, StepResult, TableRow
+from servoscope.service.assets.records import NextBlock, StepResult, TableRow, diagnosis_row
 from servoscope.service.assets.residual_history import EvaluationStatus, LatestEvaluation, history_row
 from servoscope.service.clock import LayerTimes
 from servoscope.service.store.rows import coefficient_rows, fault_rows, period_number
@@ -89,8 +89,7 @@ class ArmAsset(Asset):
         state = self.take_state()  # its rows are counted
         self.state = replace(state, examination=examination, evaluation=evaluation, pending_diagnoses=pending)
         if is_row:
-            row = {"number": window.number, "t": t, "grounds": window.why, **diagnosis.columns()}
-            self._result.rows.append(TableRow("diagnoses", row))
+            self._result.rows.append(diagnosis_row(window, diagnosis))
         self._add_sizes(fault_rows(t, "full" if is_row else "live", faults))
         self._window.trim(state.position.t, pending)
         self._advance_alarms(state.position.t)

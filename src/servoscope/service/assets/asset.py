@@ -43,6 +43,8 @@ from servoscope.service.assets.records import (
     StepResult,
     TableRow,
     check_continuity,
+    diagnosis_row,
+    owed_rows,
     transition_row,
 )
 from servoscope.service.assets.states import AssetStates, StateHolder
@@ -153,10 +155,10 @@ class Asset(StateHolder):
             if block.sequence >= position.blocks
         ]
 
-    def begin(self, position: StreamPosition) -> None:
-        """Begin with a new state, before the first sample or behind those that were counted."""
-        before = {} if self.heard or self.state is None else self.state.alarms_now
-        standing = {name: alarm_state for name, alarm_state in before.items() if alarm_state.sequence}
+    def begin(self, position: StreamPosition, before: AssetState | None = None) -> list[TableRow]:
+        """Begin with a new state in the place of one whose alarms go on; return the rows that this one owes."""
+        before = before or self.state
+        alarms = before.alarms_now.items() if before is not None else ()
         self.state = AssetState(
             asset=self.name,
             baseline=self.baseline.hash,
@@ -164,9 +166,9 @@ class Asset(StateHolder):
             monitor=self.monitor.init(),
             quality=quality.init_state(),
             examination=ExaminationState.begin(position.t, self.policy.diagnosis, self._phase, self.policy.assets),
-            # those that stand since before the first block go on
-            alarms=self.alarms.begin(self.name, position.t, standing),
+            alarms=self.alarms.begin(self.name, position.t, {name: alarm for name, alarm in alarms if alarm.sequence}),
         )
+        return owed_rows(before)
 
     def expect(self, now: float) -> None:
         """Wait for the first block from `now` [UTC s] on: an asset that was never heard has a state too."""
@@ -315,10 +317,9 @@ class Asset(StateHolder):
         examination, diagnosis = accept_diagnosis(state.examination, window, diagnosis, first=first)
         pending = tuple(waiting for waiting in state.pending_diagnoses if waiting != window)
         self.state = replace(state, examination=examination, pending_diagnoses=pending)
-        values = {"number": window.number, "t": window.until, "grounds": window.why, **diagnosis.columns()}
-        self._window.trim(self.take_state().position.t, self.take_state().pending_diagnoses)
+        self._window.trim(state.position.t, pending)
         named = fault_rows(window.until, "full", diagnosis.document.get("faults", []))
-        return StepResult([TableRow("diagnoses", values), *(TableRow("sizes", row) for row in named)], [])
+        return StepResult([diagnosis_row(window, diagnosis), *(TableRow("sizes", row) for row in named)], [])
 
     def _next_row_number(self) -> int:
         position = self.take_state().position

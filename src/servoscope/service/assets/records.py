@@ -6,7 +6,9 @@ import math
 from typing import Any, NamedTuple
 
 from servoscope.service.alarms import AlarmDefinition, AlarmTransition
-from servoscope.service.assets.checkpoint import StreamPosition
+from servoscope.service.assets.checkpoint import AssetState, StreamPosition
+from servoscope.service.assets.examination import StoredDiagnosis, undetermined
+from servoscope.service.assets.examination_schedule import PendingDiagnosis
 from servoscope.service.sources.block import Block
 
 # tables of what the samples and the state before them lead to, whenever and however often that is computed
@@ -46,6 +48,21 @@ def transition_row(transition: AlarmTransition, definition: AlarmDefinition) -> 
     plain = transition.to_dict()
     columns = {key: plain[key] for key in ("alarm", "before", "after", "cause", "who")}
     return {"t": transition.time, **columns, "document": {"event": plain["event"], "priority": definition.priority}}
+
+
+def diagnosis_row(window: PendingDiagnosis, diagnosis: StoredDiagnosis) -> TableRow:
+    """Return the row of a full diagnosis, under the number that was kept for it."""
+    values = {"number": window.number, "t": window.until, "grounds": window.why, **diagnosis.columns()}
+    return TableRow("diagnoses", values)
+
+
+def owed_rows(before: AssetState | None) -> list[TableRow]:
+    """Return the rows of full diagnoses that a state waits for, and that another state in its place does not make.
+
+    Their numbers would be lacking in the history.
+    """
+    waiting = () if before is None else before.pending_diagnoses
+    return [diagnosis_row(window, undetermined("renewed")) for window in waiting]
 
 
 class BlockContinuity(NamedTuple):
