@@ -10,7 +10,7 @@ CODE := src tests benchmarks scripts
 TYPES := $(BIN)/python -m mypy --strict src
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all test-processor lint style format figures pictures docs sbom clean
+.PHONY: help install demo test test-all test-processor world lint style format figures pictures docs sbom clean
 .DELETE_ON_ERROR:
 
 help:           ## list the targets
@@ -38,6 +38,9 @@ test test-all:
 NUMERICAL := tests/isolation tests/detection tests/diagnosis/test_last_bits.py tests/learning/test_likelihood.py tests/learning/test_learning.py
 test-processor: $(STAMP)  ## the numerical tests with the arithmetic of another processor
 	$(BIN)/python scripts/other_processor.py $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow" $(NUMERICAL)
+
+world: $(STAMP)  ## four minutes of the service in a simulated world, with faults from new seeds
+	$(BIN)/python benchmarks/chaos.py simulated --minutes 4
 
 lint: style     ## format and lint of the whole tree, and types, without changing a file
 	$(TYPES)
