@@ -41,12 +41,8 @@ from servoscope.signals.timebase import Timebase
 from servoscope.simulation import FaultEvent
 
 BEGAN = 1.7e9
-HOW = AssetPolicy(
-    DiagnosisSettings(window_s=40.0, every_s=100.0),
-    QualitySettings(),
-    AlarmSettings.model_validate({}),
-    residual_every_s=1.0,
-)
+SETTINGS = DiagnosisSettings(window_s=40.0, every_s=100.0)
+HOW = AssetPolicy(SETTINGS, QualitySettings(), AlarmSettings.model_validate({}), residual_every_s=1.0)
 
 
 def tape(samples: int = 50, *, repeat: bool = False) -> ReplayStream:

@@ -23,7 +23,7 @@ from shares import BEGAN, LOOP, Share, csv, rows
 
 from servoscope.core.errors import ConfigError
 from servoscope.models.loop import Columns
-from servoscope.service.sources import folder as folder_module
+from servoscope.service.sources import log_reader
 from servoscope.service.sources import share as share_module
 
 
@@ -136,7 +136,7 @@ def test_a_file_that_cannot_be_read_is_set_aside_and_the_next_good_one_ends_the_
 
 def test_files_move_to_done_or_failed_once_they_are_stored(share: Callable[..., Share]) -> None:
     press = share(afterwards="move")
-    press.put("a.csv", csv(*rows(0, 50)))
+    press.put("a.csv", csv(*rows(100, 50)))
     press.put("bad.csv", "t,r,u,y\n1,2,x,4\n" * 30)
     press.open()
     blocks = []
@@ -145,8 +145,13 @@ def test_files_move_to_done_or_failed_once_they_are_stored(share: Callable[..., 
     assert (press.folder / "a.csv").exists()  # nothing is stored yet
     press.source.acknowledge("press", 1)  # type: ignore[union-attr]
     press.until(lambda: (press.folder / "done/a.csv").exists() and (press.folder / "failed/bad.csv").exists())
-    press.put("a.csv", csv(*rows(50, 50)))  # the next one under the same name
+    press.put("a.csv", csv(*rows(150, 50)))  # the next one under the same name
     press.until(lambda: len(list((press.folder / "done").iterdir())) == 2)
+    press.put("late.csv", csv(*rows(0, 50)))
+    press.until(lambda: (press.folder / "failed/late.csv").exists())
+    assert (
+        press.reasons[-1].asset == "press" and "late.csv: all its rows were counted before" in press.reasons[-1].reason
+    )
     assert not list(press.folder.glob("*.csv"))
 
 
@@ -270,7 +275,7 @@ def test_a_share_that_does_not_answer_is_told(share: Callable[..., Share], monke
     press = share()
     source = press.open()
     press.settle()
-    source.transport._asked_at = time.monotonic() - 31.0
+    source.transport._reader.asked_at = time.monotonic() - 31.0
     assert os.strerror(errno.ETIMEDOUT) in source.trouble
 
 
@@ -301,7 +306,7 @@ def test_a_file_that_changes_while_it_is_read_is_read_again(
 ) -> None:
     press = share()
     path = press.put("a.csv", csv(*rows(0, 50)))
-    parse, grown = folder_module.parse_file, []
+    parse, grown = log_reader.parse_file, []
 
     def grow(*arguments: Any) -> Any:
         found = parse(*arguments)
@@ -311,7 +316,7 @@ def test_a_file_that_changes_while_it_is_read_is_read_again(
             grown.append(True)
         return found
 
-    monkeypatch.setattr(folder_module, "parse_file", grow)
+    monkeypatch.setattr(log_reader, "parse_file", grow)
     press.open()
     assert press.until_rows(100) == list(range(100))
     assert all(block.shape[1] == 50 for block in press.counted["press"])

@@ -6,28 +6,35 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
+from threading import Event
+from typing import Any
 
 import numpy as np
 import pytest
 from brokers import until
 from shares import BEGAN, Share, csv, rows
 
+from servoscope.service.sources import log_reader
 from servoscope.service.sources import share as share_module
+from servoscope.service.sources.log_files import LogFile
 from servoscope.service.sources.message import Backlog
 
 
 def test_a_file_ahead_of_the_clock_waits_in_its_place_and_blinds_nobody(share: Callable[..., Share]) -> None:
-    press, now = share(afterwards="move"), time.time()
+    press = share(afterwards="move")
     press.ahead_s = 1.0
-    early = press.put("a.csv", csv(*rows(1000, 50, origin=now - 6.0)))  # 4 s ahead
+    press.put("0.csv", csv(*rows(2000, 50)))
     source = press.open()
+    press.until_rows(50)  # there is a process that reads
+    now = time.time()
+    early = press.put("a.csv", csv(*rows(1000, 50, origin=now - 6.0)))  # 4 s ahead
     press.until(lambda: source.asset_troubles)
     assert source.asset_troubles["press"].state == "refused" and "ahead of" in source.asset_troubles["press"].why
     for number in range(3):
         press.put(f"b{number}.csv", csv(*rows(50 * number, 50, origin=now - 6.0)))
-        press.until_rows(50 * (number + 1))
+        press.until_rows(50 * (number + 2))
     assert early.exists() and press.rejections == {"ahead": 1} and not source.asset_troubles
-    assert press.until_rows(200) == [*range(150), *range(1000, 1050)]
+    assert press.until_rows(250) == [*range(2000, 2050), *range(150), *range(1000, 1050)]
     press.until(lambda: not list(press.folder.glob("*.csv")))
     assert press.rejections == {"ahead": 1} and time.time() > now + 3.4
 
@@ -96,3 +103,40 @@ def test_a_name_that_is_not_utf_8_is_written_out(share: Callable[..., Share]) ->
     press.until(lambda: press.rejections["unreadable"])
     assert "caf\\xe9\\x01.csv" in press.reasons[-1].reason and "\\xe9" in source.asset_troubles["press"].why
     press.reasons[-1].reason.encode()
+
+
+def test_a_slow_file_holds_up_its_own_asset_and_no_other_one(
+    share: Callable[..., Share], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hall, end, parse, seen = share("press", "lift", match="{asset}_*.csv"), Event(), log_reader.parse_file, list[str]()
+
+    def wait(folder: Path, file: LogFile, *arguments: Any) -> Any:
+        seen.append(file.name)
+        return (file.name != "press_0.csv" or end.wait()) and parse(folder, file, *arguments)
+
+    monkeypatch.setattr(log_reader, "parse_file", wait)
+    monkeypatch.setattr(log_reader, "QUICK_S", 0.2)
+    monkeypatch.setattr(log_reader, "FIRST_S", 0.2)
+    for k in range(3):
+        hall.put(f"press_{k}.csv", csv(*rows(20 * k, 20)))
+        hall.put(f"lift_{k}.csv", csv(*rows(20 * k, 20)))
+    hall.open()
+    assert hall.until_rows(60, "lift") == [*range(60)] and not hall.rows_of()
+    end.set()
+    assert hall.until_rows(60) == [*range(60)]
+    assert sorted(seen) == [f"{name}_{k}.csv" for name in ("lift", "press") for k in range(3)]  # each was read once
+
+
+def test_rows_that_the_service_refuses_as_ahead_come_again_and_blind_nobody(share: Callable[..., Share]) -> None:
+    press = share(afterwards="move")
+    press.put("a.csv", csv(*rows(0, 150)))
+    source = press.open()
+    blocks = []
+    until(lambda: blocks.extend(press.turn(commit=False)) or len(blocks) == 3)
+    for block in blocks[1:]:  # the clock was set back behind the first one
+        source.refuse(block, "future", "ahead")
+    press.counted["press"].append(blocks[0].signals)
+    source.acknowledge("press", 3)
+    assert press.until_rows(150) == [*range(150)]
+    press.until(lambda: (press.folder / "done/a.csv").exists())
+    assert press.rejections == {"future": 2}

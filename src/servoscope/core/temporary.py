@@ -5,12 +5,27 @@ from __future__ import annotations
 import functools
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
+
+_place: ContextVar[str | None] = ContextVar("place", default=None)  # within `temporary_folders_in`
 
 
 def temporary_folder(what: str) -> tempfile.TemporaryDirectory[str]:
     """Return a new folder, `what` in its name, that is removed when it is closed or forgotten, or this process ends."""
-    return tempfile.TemporaryDirectory(prefix=f"{what}-", dir=process_folder())
+    return tempfile.TemporaryDirectory(prefix=f"{what}-", dir=_place.get() or process_folder())
+
+
+@contextmanager
+def temporary_folders_in(folder: str) -> Iterator[None]:
+    """Make temporary folders in a folder for a while, whose owner removes what a process that is killed leaves."""
+    before = _place.set(folder)
+    try:
+        yield
+    finally:
+        _place.reset(before)
 
 
 def process_folder() -> str:

@@ -133,7 +133,10 @@ class Workers:
         with self._lock:
             if self._stopped:
                 raise WorkerError("it was stopped")
-            worker = self._idle.pop() if self._idle else self._start()
+            inside = [worker for worker in self._idle if worker.entered == (libraries, sandbox)]
+            worker = (inside or self._idle or [self._start()])[-1]
+            with suppress(ValueError):
+                self._idle.remove(worker)
             self._busy.add(worker)
         try:
             worker.enter(libraries, sandbox)
@@ -182,7 +185,7 @@ class _TaskProcess:
         self, limits: ProcessLimits | None, folder: Path | None, environment: Mapping[str, str] | None
     ) -> None:
         self._limits = limits
-        self._entered: tuple[Sequence[str], Sandbox | None] | None = None  # libraries and sandbox of its tasks
+        self.entered: tuple[Sequence[str], Sandbox | None] | None = None  # libraries and sandbox of its tasks
         # not pipes: whoever holds one end of a pipe can open the other one through /proc
         ours, theirs = socket.socketpair()
         with theirs:
@@ -197,11 +200,11 @@ class _TaskProcess:
 
     def enter(self, libraries: Sequence[str], sandbox: Sandbox | None) -> None:
         """Load libraries, and let the next tasks run within a sandbox."""
-        if self._entered != (libraries, sandbox):
-            if self._entered is not None:
+        if self.entered != (libraries, sandbox):
+            if self.entered is not None:
                 self.exchange(None)
             self.exchange((libraries, self._limits, sandbox), timeout_s=START_S)
-            self._entered = libraries, sandbox
+            self.entered = libraries, sandbox
 
     def exchange(self, question: Any, progress: Progress = lambda _: None, timeout_s: float | None = None) -> Any:
         """Send a question and return the answer; raises WorkerError, see `Workers.run`."""

@@ -198,7 +198,7 @@ class Service(ServiceParts):
                 self._receptions[block.asset].hear(self._listening.seconds)
                 asset.reception = RECEPTION_OK
             else:
-                source.rejections.add(block.asset, *result.refusal)
+                source.refuse(block, *result.refusal)
             self.handle_result(asset, result)
             self.writer.set_checkpoint(asset, block.completed_at, can_wait=result.repeatable)
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import errno
-import hashlib
 import math
 import os
 import queue
 import stat
 import time
 from collections import defaultdict, deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import AwareDatetime
 
-from servoscope.core.errors import EmptyRecordingError, OutputError
+from servoscope.core.errors import OutputError
 from servoscope.core.messages import message as text
 from servoscope.core.messages import render
 from servoscope.core.settings import NonEmptyStr
@@ -36,9 +35,9 @@ from servoscope.service.sources.log_files import (
     LogFile,
     ReadFile,
     describe_error,
-    find_first_time,
     parse_file,
 )
+from servoscope.service.sources.log_reader import LogReader
 from servoscope.service.sources.message import (
     POLL_S,
     Backlog,
@@ -57,7 +56,6 @@ MAX_REMEMBERED = 10_000  # contents by which a file that comes again is recognis
 MAX_CHANGE_S = 86400.0  # after which a file that was read is not looked at again
 MAX_ANSWER_S = 30.0  # that a share may take to answer
 IDLE_S = 0.2
-PIECE_BYTES = 1 << 20
 
 
 class FolderSettings(FolderNames):
@@ -119,21 +117,21 @@ class FolderTransport(ThreadTransport):
         self.settings, self._assets, self._folder = settings, assets, folder
         self._loops = {name: asset.loop for name, asset in assets.items()}
         self._share, self._names = Share(folder), FileNames(settings, list(assets))
+        self._reader = LogReader(self._share, self._names, settings, self._loops, self._stop_event)
         self._resumed: dict[str, float] = {}  # by asset, up to when its rows had been counted [UTC s]
         # of the thread: files that may still change, those that were dealt with, and those that lay there at first;
-        # contents by their digest; first time stamps [UTC s]
+        # contents by their digest
         self._changing: dict[str, IncompleteFile] = {}
         self._settled: dict[str, FileVersion] = {}
         self._first_names: set[str] | None = None
         self._digests: dict[bytes, str] = {}
-        self._first_times: dict[tuple[str, FileVersion], float] = {}
+        self._handed_rows = self._taken_rows = 0  # so far
         self._trouble = render(text("service.trouble.connecting"))
-        self._asked_at = math.inf  # since when an answer of the share is waited for, by the monotonic clock [s]
         self._files_wait = True  # whether there are files that are complete, or soon will be
         # files whose rows are ahead of our clock, and until when they wait [UTC s]
         self._early: dict[str, tuple[FileVersion, float]] = {}
         self._unread = list[float]()  # since when files that are complete wait, by the monotonic clock [s]
-        self._stored = queue.SimpleQueue[ReadFile]()
+        self._released = queue.SimpleQueue[ReadFile]()
 
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         """Look into the folder from now on."""
@@ -148,7 +146,7 @@ class FolderTransport(ThreadTransport):
     @property
     def trouble(self) -> str:  # type: ignore[override]
         """Why the folder cannot be reached, in words; empty: nothing."""
-        if time.monotonic() - self._asked_at > MAX_ANSWER_S:
+        if time.monotonic() - self._reader.asked_at > MAX_ANSWER_S:
             return self._describe_trouble(os.strerror(errno.ETIMEDOUT))
         return self._trouble
 
@@ -159,7 +157,8 @@ class FolderTransport(ThreadTransport):
     def backlog(self) -> Backlog:  # type: ignore[override]
         """The files that are complete and not yet stored."""
         since, handed = self._unread, len(self.waiting)
-        oldest_s = time.monotonic() - min(since) if since else 0.0
+        begins = [*since[:1], *(message.at for message in list(self.waiting)[:1])]
+        oldest_s = time.monotonic() - min(begins) if begins else 0.0
         words = text("service.folder.backlog", count=len(since) + handed, minutes=oldest_s / 60.0)
         return Backlog(len(since) + handed, oldest_s, render(words) if oldest_s > self.settings.interval_s else "")
 
@@ -168,10 +167,16 @@ class FolderTransport(ThreadTransport):
         """How long an asset may pause [s]: without bound while files wait, or the folder cannot be reached."""
         return math.inf if self._files_wait or self.trouble else self.settings.interval_s
 
+    def receive(self, most: int) -> Sequence[InboxMessage]:
+        """Return up to so many files in the order in which they were read; at once."""
+        messages = super().receive(most)
+        self._taken_rows += sum(map(_count_rows, messages))
+        return messages
+
     def preview(self) -> list[str]:
         """Return what it would read, and what it cannot."""
         try:
-            files = sorted(self._find_files(), key=self._order)
+            files = sorted(self._find_files(), key=self._reader.order)
         except OSError as error:
             return [self._describe_trouble(error.strerror or str(error))]
         lines = [f"{self._folder}: {len(files)} files match {self.settings.match}"]
@@ -194,13 +199,16 @@ class FolderTransport(ThreadTransport):
                     waiting = deque(self._look())
                     next_look = time.monotonic() + self.settings.poll_s
                 if waiting:
-                    self._read(waiting.popleft())
+                    file = waiting.popleft()
+                    if not self._read(file):  # nothing of its assets goes before it
+                        held = {file.asset, ""} if file.asset else {other.asset for other in waiting}
+                        waiting = deque(other for other in waiting if other.asset not in held)
                     self._unread = self._unread[1:]
-                self._move_stored()
+                self._take_released()
             except (OSError, OutputError) as error:
                 self._trouble = self._describe_trouble(getattr(error, "strerror", None) or str(error))
                 waiting.clear()
-            self._asked_at = math.inf
+            self._reader.asked_at = math.inf
             soon = time.monotonic() - self.settings.complete_after_s - 2.0 * self.settings.poll_s
             self._files_wait = bool(waiting) or any(file.seen_since > soon for file in self._changing.values())
             if not waiting:
@@ -211,7 +219,7 @@ class FolderTransport(ThreadTransport):
         folders = [("", self._names.depth)]
         while folders:
             place, depth = folders.pop()
-            self._asked_at = time.monotonic()
+            self._reader.asked_at = time.monotonic()
             with os.scandir(self._folder / place) as entries:
                 for entry in entries:
                     name = f"{place}{entry.name}"
@@ -250,10 +258,11 @@ class FolderTransport(ThreadTransport):
         if self._first_names is None:
             self._first_names = set(changing)
         first = _take_turns(sorted(complete, key=lambda file: file.name))[:MAX_COMPARED]
-        ordered = _take_turns(sorted(first, key=self._order)) if len(first) > 1 else first
+        ordered = _take_turns(sorted(first, key=self._reader.order)) if len(first) > 1 else first
         self._changing, self._trouble = changing, ""
         self._early = {name: early for name, early in self._early.items() if name in changing}
         self._unread = sorted(changing[file.name].seen_since for file in complete)
+        self._reader.retain(first)
         return ordered
 
     def _is_complete(self, file: LogFile, unchanged_s: float) -> bool:
@@ -267,51 +276,37 @@ class FolderTransport(ThreadTransport):
         except OSError:  # what is wrong with it is told when it is read
             return True
 
-    def _order(self, file: LogFile) -> tuple[float, str]:
-        """Return what files are sorted by: the first time stamp, and the name."""
-        key = file.name, file.version
-        if key not in self._first_times:
-            self._asked_at, loop = time.monotonic(), self._assets[file.asset or next(iter(self._assets))].loop
-            self._first_times[key] = find_first_time(self._folder, file, loop)
-        return self._first_times[key], file.name
+    def _read(self, file: LogFile) -> bool:
+        """Read a file that is complete, and hand it over; return whether it need not be waited for.
 
-    def _read(self, file: LogFile) -> None:
-        """Read a file that is complete, and hand it over; raises OSError, or OutputError where there is no room."""
-        path, assets = self._folder / file.name, [file.asset] if file.asset else list(self._assets)
-        self._first_times.pop((file.name, file.version), None)
-        rows, failures = dict[str, FileRows](), dict[str, str]()
+        Raises OSError, or OutputError where there is no room.
+        """
+        assets = [file.asset] if file.asset else list(self._assets)
         try:
-            digest = self._digest(file)
+            contents = self._reader.read(file)
         except FileNotFoundError:  # somebody has moved it
-            return
+            return True
         except PermissionError as error:  # it may be open elsewhere: it is tried again
-            refused = Reception("refused", f"{path}: cannot be read ({error.strerror})")
+            refused = Reception("refused", f"{self._folder / file.name}: cannot be read ({error.strerror})")
             if self.asset_troubles.get(assets[0]) != refused:
                 self.rejections.add(file.asset, "unreadable", refused.why)
             self.asset_troubles = {**self.asset_troubles, **dict.fromkeys(assets, refused)}
-            return
+            return True
+        if contents is None:
+            return False
+        digest, rows, failures, empty = contents
         if digest in self._digests:
+            rows, failures, empty = {}, {}, ""
             why = render(text("service.folder.repeated", file=file.name, other=self._digests[digest]))
             self.rejections.add(file.asset, "repeated", why)
-        else:
-            self._asked_at = math.inf  # how long it takes depends on its size
-            try:
-                rows, failures = parse_file(self._folder, file, self._names, self.settings, self._loops)
-            except EmptyRecordingError as error:
-                self.rejections.add(file.asset, "empty", str(error))
-            except OutputError:
-                raise
-            except Exception as error:  # readers of other packages raise what they like
-                failures = dict.fromkeys(assets, describe_error(error))
-        about = self._share.stat(file.name)
-        if (about.st_size, about.st_mtime_ns) != file.version or (failures and self._digest(file) != digest):
-            return  # it has changed meanwhile, and is read when it is complete
         if self._is_early(file, rows):
-            return
+            return True
         self._changing.pop(file.name, None)
         self._settled[file.name], self._digests[digest] = file.version, file.name
         if len(self._digests) > MAX_REMEMBERED:
             del self._digests[next(iter(self._digests))]
+        if empty:
+            self.rejections.add(file.asset, "empty", empty)
         for why in dict.fromkeys(failures.values()):
             self.rejections.add(file.asset, "unreadable", why)
         kept = {
@@ -319,13 +314,13 @@ class FolderTransport(ThreadTransport):
         }
         self.asset_troubles = kept | {name: Reception("refused", why) for name, why in failures.items()}
         is_new = file.name not in (self._first_names or ())
-        read = ReadFile(file, rows, is_new, FAILED if failures else DONE)
-        while self._handed_rows() > MAX_HANDED_ROWS and not self._stop_event.wait(POLL_S):
+        read = ReadFile(file, rows, is_new=is_new, is_failed=bool(failures))
+        while self._handed_rows - self._taken_rows > MAX_HANDED_ROWS and not self._stop_event.wait(POLL_S):
             pass
-        self.waiting.append(InboxMessage(file.name, read, time.monotonic(), partial(self._stored.put, read)))
-
-    def _handed_rows(self) -> int:
-        return sum(rows.samples.t.size for message in list(self.waiting) for rows in message.content.rows.values())
+        message = InboxMessage(file.name, read, time.monotonic(), partial(self._release, read))
+        self._handed_rows += _count_rows(message)
+        self.waiting.append(message)
+        return True
 
     def _is_early(self, file: LogFile, rows: Mapping[str, FileRows]) -> bool:
         """Whether a file has rows further ahead of our clock than allowed: it waits where it is until they are not.
@@ -347,31 +342,36 @@ class FolderTransport(ThreadTransport):
         self.asset_troubles = {**self.asset_troubles, **dict.fromkeys(early, Reception("refused", why))}
         return True
 
-    def _digest(self, file: LogFile) -> bytes:
-        """Return what tells a file from others: its content, and what its name says; logs of machines at rest agree."""
-        digest = hashlib.blake2b(f"{file.asset}\0{file.time}\0".encode(), digest_size=16)
-        with self._share.file(file.name) as opened:
-            while piece := os.read(opened, PIECE_BYTES):
-                self._asked_at = time.monotonic()
-                digest.update(piece)
-        return digest.digest()
+    def _release(self, read: ReadFile) -> None:
+        """Note that all rows of a file are stored, or were refused."""
+        read.is_released = True
+        self._released.put(read)
 
-    def _move_stored(self) -> None:
-        """Move the files whose rows are all stored."""
-        while not self._stored.empty():
-            read = self._stored.get()
-            if self.settings.afterwards == "stay":
-                continue
-            name = read.file.name
-            try:
-                about = self._share.stat(name)
-                if (about.st_size, about.st_mtime_ns) != read.file.version or not stat.S_ISREG(about.st_mode):
-                    continue  # it has grown, and is read again
-                other = f"{about.st_mtime_ns}-{name.rpartition('/')[2]}"  # where there is one of that name
-                self._share.move(name, f"{read.subfolder}/{name}", other)
-            except OSError as error:
-                why = f"{self._folder / name}: cannot be moved to {read.subfolder} ({error.strerror})"
-                self.rejections.add(read.file.asset, "not moved", why)
+    def _take_released(self) -> None:
+        """Move the files whose rows are all stored; one with rows that were ahead of our clock comes again."""
+        while not self._released.empty():
+            read = self._released.get()
+            if read.is_refused:
+                self._settled.pop(read.file.name, None)
+                self._digests = {digest: name for digest, name in self._digests.items() if name != read.file.name}
+            elif self.settings.afterwards == "move":
+                self._move(read.file, FAILED if read.is_failed else DONE)
+
+    def _move(self, file: LogFile, subfolder: str) -> None:
+        try:
+            about = self._share.stat(file.name)
+            if (about.st_size, about.st_mtime_ns) != file.version or not stat.S_ISREG(about.st_mode):
+                return  # it has grown, and is read again
+            other = f"{about.st_mtime_ns}-{file.name.rpartition('/')[2]}"  # where there is one of that name
+            self._share.move(file.name, f"{subfolder}/{file.name}", other)
+        except OSError as error:
+            why = f"{self._folder / file.name}: cannot be moved to {subfolder} ({error.strerror})"
+            self.rejections.add(file.asset, "not moved", why)
+
+
+def _count_rows(message: InboxMessage) -> int:
+    read: ReadFile = message.content
+    return sum(rows.samples.t.size for rows in read.rows.values())
 
 
 def _take_turns(files: Iterable[LogFile]) -> list[LogFile]:

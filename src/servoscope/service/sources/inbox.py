@@ -285,6 +285,12 @@ class Inbox:
                 self._collect(stream, short=True)
                 stream.is_flushed = True
 
+    def refuse(self, block: Block, kind: str, why: str) -> None:
+        """Count a block that the service has left out for its time stamps, before it is acknowledged."""
+        self.rejections.add(block.asset, kind, why)
+        if kind == "future":
+            self.decoder.refuse(block)
+
     def acknowledge(self, asset: str, blocks: int) -> None:
         """Release the messages that end in so many more blocks, and confirm these to a sender that keeps them."""
         last: tuple[int, int] | None = None

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import fnmatch
-import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from zoneinfo import ZoneInfo
 
+import numpy as np
 from pydantic import Field
 
+from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import ConfigError, RecordingError, ServoscopeError
 from servoscope.core.settings import NonEmptyStr
 from servoscope.models.loop import Loop
 from servoscope.service.sources.settings import SourceSettings
-from servoscope.signals.readers.reader_process import read_restricted
+from servoscope.signals.readers.reader_process import run_restricted
 from servoscope.signals.readers.recording_file import first_time, read_log
 from servoscope.signals.samples import Samples
 
@@ -75,13 +77,16 @@ class FileRows(NamedTuple):
     offset: float  # what makes seconds since 1970 of their time stamps [s]
 
 
-class ReadFile(NamedTuple):
+@dataclass
+class ReadFile:
     """A file that was read."""
 
     file: LogFile
-    rows: dict[str, FileRows]  # by asset
+    rows: Mapping[str, FileRows]  # by asset
     is_new: bool  # whether it came while we looked
-    subfolder: str  # where it belongs when its blocks are stored
+    is_failed: bool  # whether its rows are of no use, or late
+    is_refused: bool = False  # whether rows were refused, and have to come again
+    is_released: bool = False  # whether all its rows are stored, or were refused
 
 
 class FileNames:
@@ -117,13 +122,37 @@ class FileNames:
 def parse_file(
     folder: Path, file: LogFile, names: FileNames, settings: FolderNames, loop_of: Mapping[str, Loop]
 ) -> tuple[dict[str, FileRows], dict[str, str]]:
-    """Return the rows of a file by asset, and of which assets they cannot be used, and why."""
+    """Return the rows of a file by asset, and of which assets they cannot be used, and why; in a restricted process.
+
+    Raises RecordingError if the file cannot be read.
+    """
+    loops = {file.asset: loop_of[file.asset]} if file.asset else dict(loop_of)
+    given = (folder, file, names, settings, loops)
+    about, columns = run_restricted((folder,), folder / file.name, file.version.size, f"{__name__}:pack_rows", *given)
+    rows, others = dict[str, FileRows](), iter(columns)
+    for name, offset, channels in about["rows"]:
+        t, r, u, y, restart = (next(others) for _ in range(5))
+        carried = {channel: next(others) for channel in channels}
+        rows[str(name)] = FileRows(Samples.from_columns(t, r, u, y, restart, carried), float(offset))
+    return {name: rows[name] for name in loops if name in rows}, about["failures"]
+
+
+def pack_rows(*given: Any) -> tuple[dict[str, Any], list[FloatArray]]:
+    """Return what `extract_rows` finds, as `run_restricted` takes it."""
+    rows, failures = extract_rows(*given)
+    columns = [x for one in rows.values() for x in (*one.samples.columns, *one.samples.channels.values())]
+    about = [(name, one.offset, list(one.samples.channels)) for name, one in rows.items()]
+    return {"rows": about, "failures": failures}, columns
+
+
+def extract_rows(
+    folder: Path, file: LogFile, names: FileNames, settings: FolderNames, loop_of: Mapping[str, Loop]
+) -> tuple[dict[str, FileRows], dict[str, str]]:
+    """Do what `parse_file` does, in this process."""
     rows, failures, path = dict[str, FileRows](), dict[str, str](), folder / file.name
-    assets = [file.asset] if file.asset else list(loop_of)
-    loops = {loop_of[name].hash(): loop_of[name] for name in assets}
+    loops = {loop.hash(): loop for loop in loop_of.values()}
     for key, loop in loops.items():
-        with read_restricted(folder):
-            logged = read_log(path, loop, settings.asset_column)
+        logged = read_log(path, loop, settings.asset_column)
         for called, part in logged.parts.items():
             name = file.asset or names.assets.get(called, "")
             if not name or loop_of[name].hash() != key:
@@ -153,13 +182,24 @@ def _named_time(text: str, loop: Loop) -> float | None:
 
 
 def find_first_time(folder: Path, file: LogFile, loop: Loop) -> float:
-    """Return the time of the first row [UTC s], as the file, its name or its date says."""
-    try:
-        with read_restricted(folder):
-            first = first_time(folder / file.name, loop)
-    except Exception:  # why it cannot be read is told when it is its turn
-        first = math.nan
-    return first if first >= MIN_EPOCH_S else _named_time(file.time, loop) or file.modified_at
+    """Return the time of the first row [UTC s], as the file says it, read in a restricted process, or its name or date.
+
+    Raises RecordingError if it cannot be read.
+    """
+    path = folder / file.name
+    _, (first,) = run_restricted((folder,), path, file.version.size, f"{__name__}:pack_first_time", path, loop)
+    t = float(first[0])
+    return t if t >= MIN_EPOCH_S else told_time(file, loop)
+
+
+def pack_first_time(path: Path, loop: Loop) -> tuple[None, list[FloatArray]]:
+    """Return the first time stamp of a file, as `run_restricted` takes it."""
+    return None, [np.array([first_time(path, loop)])]
+
+
+def told_time(file: LogFile, loop: Loop) -> float:
+    """Return the time of the first row [UTC s] as the name of a file says it, or its date."""
+    return _named_time(file.time, loop) or file.modified_at
 
 
 def describe_error(error: Exception) -> str:

@@ -134,6 +134,9 @@ class Decoder(ABC):
         except Exception as error:  # decoders of other packages raise what they like
             return MessageError("not a block", f"{type(error).__name__}: {' '.join(str(error).split())[:100]}")
 
+    def refuse(self, block: Block) -> None:  # noqa: B027
+        """Take back a block that the service has refused as ahead of its clock."""
+
     def requests(self) -> Iterable[tuple[str, bytes]]:
         """Return messages, with their addresses, that ask senders for what it lacks."""
         return ()

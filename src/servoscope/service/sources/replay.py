@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import AwareDatetime
 
+from servoscope.core.arrays import FloatArray
 from servoscope.core.settings import NonNegative
 from servoscope.models.loop import Loop
 from servoscope.service.config_types import Seconds
@@ -22,6 +23,8 @@ from servoscope.service.sources.message import BlockDecoder, InboxMessage, Sourc
 from servoscope.service.sources.settings import SourceSettings
 from servoscope.signals import Recording
 from servoscope.signals.readers import is_address, read
+from servoscope.signals.readers.archives import archive_of
+from servoscope.signals.readers.reader_process import run_restricted
 
 SEPARATION_SAMPLES = 2  # sample times between two recordings, or two rounds: a gap, for they do not join
 
@@ -94,10 +97,11 @@ class ReplayTransport(Transport):
         self.settings, self.clock_rate = settings, settings.speed
         self._streams: dict[str, tuple[ReplayStream, float]] = {}  # with their start [UTC s], once it is open
         shared: dict[tuple[Path, str], Recording] = {}  # assets may replay the same file
+        readable = tuple(dict.fromkeys(_place(path) for files, _ in assets.values() for path in files))
         for asset, (files, loop) in assets.items():
             for path in files:
                 if (path, loop.hash()) not in shared:
-                    shared[path, loop.hash()] = read(path, loop)
+                    shared[path, loop.hash()] = _read(path, loop, readable)
             samples = max(1, round(settings.block * loop.sample_rate))
             recordings = tuple(shared[path, loop.hash()] for path in files)
             carried = (covariates or {}).get(asset, ())
@@ -143,3 +147,29 @@ class ReplayTransport(Transport):
     def close(self) -> None:
         """Stop."""
         self._queue.clear()
+
+
+def _read(path: Path, loop: Loop, readable: tuple[Path, ...]) -> Recording:
+    """Read a recording in a restricted process, which can open what is `readable`; a table is asked from here."""
+    if is_address(path):
+        return read(path, loop)
+    place = _place(path)
+    size = place.stat().st_size if place.exists() else 0
+    about, columns = run_restricted(readable, path, size, f"{__name__}:pack_recording", path, loop)
+    t, r, u, y, restart, run = columns[:6]
+    channels = dict(zip(about["channels"], columns[6:], strict=True))
+    about = {"name": path.name, "sample_rate": float(about["rate"]), "run": run.astype(np.int32)}
+    return Recording(t, r, u, y, restart.astype(np.bool_), channels, **about)
+
+
+def pack_recording(path: Path, loop: Loop) -> tuple[dict[str, Any], list[FloatArray]]:
+    """Return the columns of a recording, as `run_restricted` takes them."""
+    recording = read(path, loop)
+    about = {"channels": list(recording.channels), "rate": recording.sample_rate}
+    return about, [*recording.columns, *recording.channels.values()]
+
+
+def _place(path: Path) -> Path:
+    """Return the file that has to be opened: the archive, where a path leads into one."""
+    archive = archive_of(path)
+    return (archive[0] if archive else path).absolute()

@@ -16,7 +16,7 @@ from servoscope.signals.readers.addresses import open_address
 from servoscope.signals.readers.archives import ARCHIVES, archive_of, unpack
 from servoscope.signals.readers.csv import is_utf16
 from servoscope.signals.readers.long_format import widen
-from servoscope.signals.readers.reader_process import is_restricted, open_bounded
+from servoscope.signals.readers.reader_process import is_inside, open_bounded
 from servoscope.signals.readers.table import TableFile
 
 ENTRY_POINTS = "servoscope.readers"  # of other packages: name is the suffix without its dot, object the function
@@ -48,7 +48,7 @@ class Reader(NamedTuple):
                 f"{path}: {self.format} files need {self.library}, pip install 'servoscope[{self.extra}]'"
             )
         layout = (text,) if self.format == "CSV" else ()
-        if self.bounded or is_restricted():
+        if self.bounded and not is_inside():
             return open_bounded(path, self.format, self.module, self.function, self.library or self.module, *layout)
         opened: TableFile = getattr(importlib.import_module(self.module), self.function)(path, *layout)
         return opened
@@ -165,11 +165,8 @@ def _open_plain(path: Path, text: TextLayout | None) -> TableFile:
             what = f", it looks like a {kind}" if kind else ""
             known = ", ".join(readable_suffixes())
             raise RecordingError(f"{path}: unknown kind of file {path.suffix!r}{what}; readable are {known}")
-        if is_restricted():
-            opened = open_bounded(path, suffix, other.module, other.attr, other.module)
-        else:
-            opener: Callable[[Path], TableFile] = other.load()
-            opened = opener(path)
+        opener: Callable[[Path], TableFile] = other.load()
+        opened = opener(path)
     opened = widen(opened)
     if not opened.columns:
         raise RecordingError(f"{path}: holds no columns of numbers")

@@ -1,7 +1,7 @@
 """Files whose libraries a damaged one may hang or kill: read in processes of their own, with limits.
 
-Commands read so what may do that; a service reads all files so. Rows come back as streams of Arrow, each batch with
-what its `Table` knows besides the columns.
+Commands open so what may do that: rows come back as streams of Arrow, each batch with what its `Table` knows besides
+the columns. A service leaves all that is done with a file, unpacking too, to such a process.
 """
 
 from __future__ import annotations
@@ -10,19 +10,29 @@ import atexit
 import importlib
 import json
 import os
+import shutil
 import weakref
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
 from operator import attrgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 from uuid import uuid4
 
-from servoscope.core.errors import EmptyRecordingError, RecordingError
+import numpy as np
+
+from servoscope.core.arrays import FloatArray
+from servoscope.core.errors import (
+    EmptyRecordingError,
+    IrregularTimeError,
+    LoopError,
+    NotEnoughError,
+    OutputError,
+    RecordingError,
+    ServoscopeError,
+)
 from servoscope.core.sandbox import Sandbox
-from servoscope.core.temporary import temporary_folder
+from servoscope.core.temporary import temporary_folder, temporary_folders_in
 from servoscope.core.workers import ProcessLimits, Progress, WorkerError, Workers
 from servoscope.signals.readers.table import Table, TableFile, rows_wanted
 
@@ -36,42 +46,86 @@ LIBRARIES = (
 )  # what most readers use; Arrow looks for pandas at its first array
 
 TABLE_KEY = b"table"  # of the metadata of a batch
+ERRORS = {
+    kind.__name__: kind for kind in (EmptyRecordingError, NotEnoughError, IrregularTimeError, LoopError, OutputError)
+}
+COLUMNS = "columns"  # the file in which columns come back
 
-_folder: ContextVar[Path | None] = ContextVar("folder", default=None)  # within `read_restricted`
-_shared: dict[Path, TemporaryDirectory[str]] = {}  # what the process for such a folder may write
+_kept: dict[tuple[Path, ...], TemporaryDirectory[str]] = {}  # by what a process may read, where it may write
 _workers = Workers(LIMITS)  # kept, because starting one and loading its libraries takes a second
 atexit.register(_workers.close)
-_opened: dict[tuple[str, int, int, str], TableFile] = {}  # in a worker: the file that it read last
+# in a worker: the file that it read last; whether all that is done with a file is done there
+_opened: dict[tuple[str, int, int, str], TableFile] = {}
+_is_inside = False
 
 
-@contextmanager
-def read_restricted(folder: Path) -> Iterator[None]:
-    """Read all files in restricted processes, in this thread for a while: those of a folder in one that lasts.
+def is_inside() -> bool:
+    """Tell whether this is a restricted process, in which a reader needs no other one."""
+    return _is_inside
 
-    It can open the files of the folder, and no others.
+
+def run_restricted(
+    readable: tuple[Path, ...], path: Path, size: int, task: str, *arguments: Any
+) -> tuple[Any, list[FloatArray]]:
+    """Let a task read a file in a process that lasts, which can open what is `readable`, files or folders, and no more.
+
+    `path`, `size` [B]: of the file, for errors, and for how long it may take. The task, ``"package.module:name"``, is
+    called with the arguments, and returns what can be written as JSON, and columns of numbers. Raises what it raises on
+    purpose, RecordingError where it took more time or memory than files of its size do, OutputError without room.
     """
-    before = _folder.set(folder.absolute())
+    if readable not in _kept:  # a process for each file would cost more than what most files hold
+        _kept[readable] = temporary_folder("read")
+    kept = _kept[readable].name
+    scratch = Path(kept) / uuid4().hex  # removed whatever becomes of the process
+    sandbox = Sandbox(read=tuple(map(str, readable)), write=(kept,))
+    libraries = (__name__, task.partition(":")[0])
+    timeout_s = BASE_S + size / BYTES_PER_S
     try:
-        yield
+        scratch.mkdir()
+        given = (f"{__name__}:run_task", task, arguments, str(scratch))
+        answer = _workers.run(*given, timeout_s=timeout_s, libraries=libraries, sandbox=sandbox)
+        if "error" in answer:
+            raise ERRORS.get(answer["kind"], RecordingError)(str(answer["error"]))
+        with (scratch / COLUMNS).open("rb") as file:
+            return answer["about"], [np.fromfile(file, count=int(rows)) for rows in answer["rows"]]
+    except WorkerError as error:
+        raise RecordingError(f"{path}: is damaged ({str(error)[:120]}), export it again") from None
+    except OSError as error:
+        raise OutputError(f"{kept}: cannot be written ({error.strerror}), make room") from None
     finally:
-        _folder.reset(before)
+        shutil.rmtree(scratch, ignore_errors=True)
 
 
-def is_restricted() -> bool:
-    """Tell whether all files are read in restricted processes."""
-    return _folder.get() is not None
+def run_task(_progress: Progress, task: str, arguments: tuple[Any, ...], scratch: str) -> dict[str, Any]:
+    """Run a task of `run_restricted`, in the worker."""
+    global _is_inside
+    _is_inside = True
+    _silence()
+    module, _, name = task.partition(":")
+    try:
+        with temporary_folders_in(scratch):
+            about, columns = getattr(importlib.import_module(module), name)(*arguments)
+    except ServoscopeError as error:
+        return {"error": str(error), "kind": type(error).__name__}
+    try:
+        with Path(scratch, COLUMNS).open("wb") as file:
+            for column in columns:
+                np.ascontiguousarray(column, np.float64).tofile(file)
+    except OSError as error:
+        return {"error": f"{scratch}: cannot be written ({error.strerror}), make room", "kind": OutputError.__name__}
+    return {"about": about, "rows": [len(column) for column in columns]}
 
 
 def open_bounded(path: Path, kind: str, module: str, function: str, library: str, *layout: Any) -> TableFile:
-    """Open a file in a worker, which can open no other one, or those of the folder that is being read.
+    """Open a file in a worker, which can open no other one.
 
     `kind`: what errors call the file; `module`, `function`: what opens it, with `library`, given the path and `layout`.
     Raises RecordingError if it cannot be read, also where it would take more time or memory than files of its size do.
     """
     timeout_s = BASE_S + path.stat().st_size / BYTES_PER_S
     place = (module, function, str(path.absolute()), str(path), layout)
-    folder, sandbox = _sandbox(path)
-    target = Path(folder.name) / f"rows-{uuid4().hex}.arrow"
+    folder = temporary_folder("read")
+    target, sandbox = Path(folder.name) / "rows.arrow", Sandbox(read=(place[2],), write=(folder.name,))
 
     def run(task: str, *arguments: Any) -> Any:
         try:
@@ -100,25 +154,12 @@ def open_bounded(path: Path, kind: str, module: str, function: str, library: str
                     for batch, metadata in stream.iter_batches_with_custom_metadata():
                         yield _read_table(path.name, batch, metadata)
 
-    weakref.finalize(read_chunks, target.unlink, missing_ok=True)
-    if folder not in _shared.values():
-        weakref.finalize(read_chunks, folder.cleanup)
+    weakref.finalize(read_chunks, folder.cleanup)
     description = run("describe_file")
     groups = tuple(tuple(group) for group in description["groups"])
     return TableFile(
         path, tuple(description["columns"]), read_chunks, description["others"], groups, description["aliases"]
     )
-
-
-def _sandbox(path: Path) -> tuple[TemporaryDirectory[str], Sandbox]:
-    """Return where the rows of a file are written, and within what it is read."""
-    folder, file = _folder.get(), path.absolute()
-    if folder is None or not file.is_relative_to(folder) or file.is_symlink():
-        own = temporary_folder("read")
-        return own, Sandbox(read=(str(file),), write=(own.name,))
-    if folder not in _shared:  # a process for each file would cost more than what most files hold
-        _shared[folder] = temporary_folder("read")
-    return _shared[folder], Sandbox(read=(str(folder),), write=(_shared[folder].name,))
 
 
 def _read_table(name: str, batch: Any, metadata: Any) -> Table:
@@ -189,13 +230,18 @@ def extract_rows(
 
 
 def _open(module: str, function: str, path: str, layout: tuple[Any, ...]) -> TableFile:
-    silent = os.open(os.devnull, os.O_WRONLY)
-    for stream in (1, 2):  # libraries print what they know of a damaged file; answers have a stream of their own
-        os.dup2(silent, stream)
-    os.close(silent)
+    _silence()
     about = Path(path).stat()
     key = path, about.st_mtime_ns, about.st_size, str(layout)
     if key not in _opened:
         _opened.clear()
         _opened[key] = attrgetter(function)(importlib.import_module(module))(Path(path), *layout)
     return _opened[key]
+
+
+def _silence() -> None:
+    """Discard what libraries print of a damaged file; answers have a stream of their own."""
+    silent = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        os.dup2(silent, stream)
+    os.close(silent)
