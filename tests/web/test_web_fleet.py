@@ -59,12 +59,13 @@ def names(answer: Any) -> list[str]:
 
 
 def test_pages_are_parts_of_the_whole_list_the_most_urgent_first(context: Context) -> None:
-    whole, *pages, group, search = ask(
+    whole, *pages, group, search, healthy, fault, neither = ask(
         context,
         ("GET", "/assets", None),
         *(("GET", f"/assets?limit=200&offset={k}", None) for k in (0, 200, 400, 600)),
         ("GET", "/assets?limit=10&offset=10&group=hall+1&verdict=healthy", None),
         ("GET", "/assets?limit=10&search=PRESS_44", None),
+        *(("GET", f"/assets?limit=500&search={text}", None) for text in ("HALL+1+healthy", "As+it+was", "nothing")),
     )
     assert len(names(whole)) == ASSETS and [name for page in pages for name in names(page)] == names(whole)
     assert [len(names(page)) for page in pages] == [200, 200, 50, 0]
@@ -75,6 +76,12 @@ def test_pages_are_parts_of_the_whole_list_the_most_urgent_first(context: Contex
     like = [row["asset"] for row in whole.json()["assets"] if (row["group"], row["verdict"]) == ("hall 1", "healthy")]
     assert names(group) == like[10:20] and group.json()["total"] == len(like)
     assert search.json()["total"] == 11 and set(names(search)) <= {"press_44", *(f"press_44{k}" for k in range(10))}
+    shown = {
+        row["asset"]: f"{row['asset']} {row['group']} {row['summary']}".casefold() for row in whole.json()["assets"]
+    }
+    for answer, text in ((healthy, "hall 1 healthy"), (fault, "as it was"), (neither, "nothing")):
+        assert names(answer) == [name for name in names(whole) if text in shown[name]], text
+    assert len(names(healthy)) > 200 and len(names(fault)) == 5
     assert whole.headers["content-encoding"] == "gzip" and len(whole.content) > 50_000
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple, get_args
 import msgspec
 import sqlalchemy as sa
 
-from servoscope.service.alarms import PRIORITIES, LifecycleState, Ne107, Priority
+from servoscope.service.alarms import FAULT_ALARM, PRIORITIES, LifecycleState, Ne107, Priority
 from servoscope.service.alarms.records import UNACKNOWLEDGED_STATES
 from servoscope.service.assets.status import AssetStatus, ServiceStatus
 from servoscope.service.store import Store, tables
@@ -56,6 +56,7 @@ class _Columns(msgspec.Struct):
     level: float | None = None
     alarms: dict[str, _Alarm] = {}
     about: _About = msgspec.field(default_factory=_About)
+    learning: msgspec.Raw | None = None
     service: bool = False
 
 
@@ -63,12 +64,16 @@ _decoder = msgspec.json.Decoder(_Columns)
 
 
 class FleetLine(NamedTuple):
-    """An asset's columns: negative severity and name, by which it is sorted, then group and verdict."""
+    """An asset's columns: negative severity and name, by which it is sorted, then group and verdict.
+
+    `is_plain`: whether it is healthy, and its headline says no more than that.
+    """
 
     urgency: float
     asset: str
     group: str
     verdict: str
+    is_plain: bool
 
 
 @dataclass
@@ -91,12 +96,16 @@ class FleetTable:
                 for name, text in self.store.fetch_tuples(sa.select(_COLUMNS.asset, _TEXT))
             ]
             self.lines = sorted(
-                FleetLine(-severity(status), name, status.about.group, status.verdict)
+                FleetLine(-severity(status), name, status.about.group, status.verdict, _is_plain(status))
                 for name, status in stored
                 if not status.service
             )
             self.services = sorted(name for name, status in stored if status.service)
             self._read_at = time.monotonic()
+
+
+def _is_plain(status: _Columns) -> bool:
+    return status.verdict == "healthy" and FAULT_ALARM not in status.alarms and status.learning in (None, b"null")
 
 
 def severity(status: AssetStatus | _Columns) -> float:

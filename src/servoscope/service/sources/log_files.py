@@ -140,8 +140,8 @@ def parse_file(
 def pack_rows(*given: Any) -> tuple[dict[str, Any], list[FloatArray]]:
     """Return what `extract_rows` finds, as `run_restricted` takes it."""
     rows, failures = extract_rows(*given)
-    columns = [x for one in rows.values() for x in (*one.samples.columns, *one.samples.channels.values())]
-    about = [(name, one.offset, list(one.samples.channels)) for name, one in rows.items()]
+    columns = [x for own in rows.values() for x in (*own.samples.columns, *own.samples.channels.values())]
+    about = [(name, own.offset, list(own.samples.channels)) for name, own in rows.items()]
     return {"rows": about, "failures": failures}, columns
 
 

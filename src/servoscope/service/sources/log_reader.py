@@ -75,8 +75,8 @@ class LogReader:
         Where the time cannot be read, it is as the file's name or its date says it; a file that is slow comes first.
         Raises OSError, and OutputError.
         """
-        if file not in self._first_times and (found := self._find_first_time(file)) is not None:
-            self._first_times[file] = found
+        if file not in self._first_times and (future := self._find_first_time(file)) is not None:
+            self._first_times[file] = future
         return self._first_times.get(file, -math.inf), file.name
 
     def _find_first_time(self, file: LogFile) -> float | None:
@@ -91,9 +91,9 @@ class LogReader:
                 return None
             self._contents[file] = contents
             self._kept_rows += contents.count_rows()
-            return min((float(one.samples.t[0]) + one.offset for one in contents.rows.values()), default=told)
-        found = self._readers.ask(file, "first time", partial(find_first_time, self._share.path, file, loop))
-        return None if found is None else told if found.exception() else found.result()
+            return min((float(rows.samples.t[0]) + rows.offset for rows in contents.rows.values()), default=told)
+        future = self._readers.ask(file, "first time", partial(find_first_time, self._share.path, file, loop))
+        return None if future is None else told if future.exception() else future.result()
 
     def read(self, file: LogFile) -> Contents | None:
         """Return what a file holds; None: it is slow, and still being read, or has changed.
@@ -110,10 +110,10 @@ class LogReader:
         contents = Contents(self._digest(file))
         self.asked_at = math.inf  # how long it takes depends on its size
         parse = partial(parse_file, self._share.path, file, self._names, self._settings, self._loops)
-        if (found := self._readers.ask(file, "rows", parse)) is None:
+        if (future := self._readers.ask(file, "rows", parse)) is None:
             return None
         try:
-            contents = Contents(contents.digest, *found.result())
+            contents = Contents(contents.digest, *future.result())
         except EmptyRecordingError as error:
             contents = contents._replace(empty=str(error))
         except OutputError:
@@ -173,7 +173,9 @@ class _Readers:
                 threading.Thread(target=self._work, name="file reader", daemon=True).start()
             self._tasks.put((reading.future, read))
             wait([reading.future], patience_s)
-        while len(slow := [one.future for one in self._readings.values() if not one.future.done()]) > MAX_SLOW:
+        while (
+            len(slow := [reading.future for reading in self._readings.values() if not reading.future.done()]) > MAX_SLOW
+        ):
             if self._stop.is_set():
                 return None
             wait(slow, LOOK_S, FIRST_COMPLETED)
@@ -184,12 +186,16 @@ class _Readers:
 
     def is_reading(self, file: LogFile) -> bool:
         """Tell whether a file was asked for, and is still being read."""
-        return any(one.file == file and not one.future.done() for one in self._readings.values())
+        return any(reading.file == file and not reading.future.done() for reading in self._readings.values())
 
     def retain(self, files: Iterable[LogFile]) -> None:
         """Forget what was read of files that are not there any more."""
         there = set(files)
-        kept = {key: one for key, one in self._readings.items() if one.file in there or not one.future.done()}
+        kept = {
+            key: reading
+            for key, reading in self._readings.items()
+            if reading.file in there or not reading.future.done()
+        }
         self._readings = kept
 
     def _work(self) -> None:

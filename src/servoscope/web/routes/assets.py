@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,6 +12,7 @@ import numpy as np
 from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
 
 from servoscope.core.errors import BaselineError, LoopError, StoreError, StoreUnavailableError
+from servoscope.core.messages import say
 from servoscope.design.operating_limits import OperatingLimit, operating_limits
 from servoscope.prognosis.forecast import prognose
 from servoscope.report.downsample import signal_columns
@@ -37,7 +39,7 @@ from servoscope.web.schemas.requests import (
     SizeQuery,
     TrendQuery,
 )
-from servoscope.web.statuses import StatusEntry, asset_statuses, read_statuses, service_statuses
+from servoscope.web.statuses import FleetLine, StatusEntry, asset_statuses, read_statuses, service_statuses
 
 router = APIRouter(tags=["assets"], dependencies=[VIEWER])
 
@@ -78,28 +80,32 @@ def list_assets(context: ContextDep, query: Annotated[FleetQuery, Query()]) -> s
     mark, fleet = context.event_hub.mark, context.event_hub.fleet
     fleet.read(anew=query.limit is None)
     lines, services = fleet.lines, read_statuses(context.store, fleet.services)
-    wanted = [
-        line.asset for line in lines if query.group in (None, line.group) and query.verdict in (None, line.verdict)
-    ]
+    wanted = [line for line in lines if query.group in (None, line.group) and query.verdict in (None, line.verdict)]
     if query.search:
-        text = query.search.casefold()
-        listed = _asset_rows(context.store, wanted)
-        rows = [row for row in listed if text in f"{row.asset} {row.group} {row.summary}".casefold()]
-        total, rows = len(rows), query.page(rows)
-    else:
-        total, rows = len(wanted), _asset_rows(context.store, query.page(wanted))
+        wanted = _search(context.store, wanted, query.search)
+    asked = [line.asset for line in wanted]
     return schemas.FleetStatus(
         now=time.time(),
         configured=len(context.config.assets) if context.config is not None else 0,
-        total=total,
+        total=len(asked),
         mark=mark,
-        assets=rows,
+        assets=_asset_rows(context.store, query.page(asked)),
         groups=sorted({line.group for line in lines if line.group}),
         services=[
             schemas.ServiceRow.from_status(status_entry.name, status)
             for status_entry, status in service_statuses(services.values())
         ],
     )
+
+
+def _search(store: Store, lines: Iterable[FleetLine], words: str) -> list[FleetLine]:
+    """Return the assets with a text in their name, group or headline; only headlines of their own are looked up."""
+    text, healthy = words.casefold(), say("report.headline.healthy", point=None)
+    shown = [(line, f"{line.asset} {line.group} {healthy if line.is_plain else ''}".casefold()) for line in lines]
+    others = [line.asset for line, known in shown if text not in known and not line.is_plain]
+    rows = _asset_rows(store, others) if others else []
+    also = {row.asset for row in rows if text in f"{row.asset} {row.group} {row.summary}".casefold()}
+    return [line for line, known in shown if text in known or line.asset in also]
 
 
 def _asset_rows(store: Store, names: list[str]) -> list[schemas.AssetRow]:
