@@ -46,6 +46,20 @@ def test_a_new_state_owes_the_rows_of_diagnoses_under_way_and_keeps_alarms_that_
     assert after.alarms["fault"].state == "unacknowledged" and not after.pending_diagnoses
 
 
+def test_blocks_lost_before_one_that_is_ahead_of_the_clock_are_named() -> None:
+    monitor, x = Monitor(halls.baseline()), halls.recorded(1)
+    asset = Asset("press", monitor.baselines[0], monitor, halls.POLICY)
+    t = halls.BEGAN + np.arange(50) / 100.0
+    ahead = Block("press", 4, t + 7200.0, x.r[:50], x.u[:50], x.y[:50])
+    asset.process(replace(ahead, sequence=0, t=t), halls.BEGAN + 60.0)
+    result = asset.process(ahead, halls.BEGAN + 60.0)
+    (row,) = result.rows
+    assert result.refusal is not None and row.values["what"] == "blocks lost"
+    assert row.values["document"] == {"blocks": 3, "after": [0, 0], "before": [0, 4]}
+    assert asset.take_state().position.lost == 3
+    assert not asset.process(replace(ahead, sequence=5), halls.BEGAN + 60.0).rows
+
+
 @pytest.fixture(scope="module")
 def ended(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a service that has followed two assets to the end of their recordings, and was stopped."""

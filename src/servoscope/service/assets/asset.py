@@ -38,6 +38,7 @@ from servoscope.service.assets.recent_blocks import PackedBlock, RecentBlocks
 from servoscope.service.assets.reception import RECEPTION_OK, Reception
 from servoscope.service.assets.records import (
     REPEATABLE_TABLES,
+    BlockContinuity,
     BlockRefusal,
     NextBlock,
     StepResult,
@@ -239,23 +240,22 @@ class Asset(StateHolder):
 
     def _leave_out(self, block: Block, kind: Literal["late", "future"], **seconds: float) -> StepResult:
         """Count a block that is left out for its time stamps; its place in its stream has passed."""
-        refusal = BlockRefusal(kind, render(message(f"service.reception.{kind}", **seconds)))
+        refusal, rows = BlockRefusal(kind, render(message(f"service.reception.{kind}", **seconds))), list[TableRow]()
         if self.state is not None:
             position = replace(self.state.position, **{kind: getattr(self.state.position, kind) + 1})
-            if kind == "future" and self.heard and block.stream == position.stream:
-                lost = max(0, block.sequence - position.sequence - 1)
-                sequence = max(block.sequence, position.sequence)
-                position = replace(position, sequence=sequence, lost=position.lost + lost)
+            lost = block.sequence - position.sequence - 1
+            if kind == "future" and self.heard and block.stream == position.stream and lost >= 0:
+                rows = [BlockContinuity(lost, anew=False).audit_row(position, block)] if lost else []
+                position = replace(position, sequence=block.sequence, lost=position.lost + lost)
             self.state = replace(self.state, position=position)
-        return StepResult([], [], refusal)
+        return StepResult(rows, [], refusal)
 
     def advance_time(self, elapsed_s: float) -> StepResult:
         """Advance the asset's clock without a block: after a while, silence is an alarm."""
         self._result = StepResult([], [])
         if not self.has_state:
             return self._result
-        state = self.take_state()
-        now = state.position.t + elapsed_s
+        now = (state := self.take_state()).position.t + elapsed_s
         # before its first block it waits: that is told by its reception, and not as the silence of a sensor
         quality_state, changed = state.quality, tuple[quality.QualityFinding, ...]()
         if self.heard:
