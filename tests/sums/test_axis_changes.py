@@ -114,6 +114,18 @@ def test_a_change_is_found_wherever_it_is(begin: float) -> None:
     assert abs(verdict.segments[1].begin_s[1] - begin) <= 1.5
 
 
+@pytest.mark.parametrize("after", [1.0, 1.5, 2.0])
+def test_a_change_at_the_end_has_no_name_that_its_few_blocks_do_not_show(after: float) -> None:
+    sums = equations().sums(recorded(22, (50.0, HEAVY)))
+    K = round((50.0 + after) / sums.block_s)
+    *healthy_before, last = judge(healthy(), sums.part(0, K)).segments
+    assert not any(segment.changed for segment in healthy_before)
+    if last.changed:
+        assert abs(last.begin_s[1] - 50.0) <= 1.0
+        best = last.explanations[0]
+        assert best.causes == ("payload",) or best.probability < 0.8
+
+
 def test_a_recording_that_is_changed_from_its_start_on_is_changed_as_a_whole() -> None:
     verdict = judge(healthy(), equations().sums(recorded(23, (0.0, HEAVY))))
     assert states(verdict) == [{"payload": pytest.approx(1.25, rel=0.03)}]
@@ -154,8 +166,9 @@ def test_the_order_of_healthy_recordings_does_not_matter() -> None:
 
 def test_a_stretch_without_motion_adds_nothing() -> None:
     sums = equations().sums(recorded(24))
-    rest: FloatArray = np.zeros_like(sums.A[:60])
-    still = sums._replace(A=rest, c=rest[:, 0], begin_s=sums.begin_s[-1] + sums.block_s * np.arange(1.0, 61.0))
+    rest: FloatArray = np.zeros((60, 10, len(equations().names)))
+    begin_s = sums.begin_s[-1] + sums.block_s * np.arange(1.0, 61.0)
+    still = Sums.of_rows(rest, rest[..., 0], begin_s, sums.block_s, (1.0,))
     alone, followed = judge(healthy(), sums), judge(healthy(), sums.followed_by(still))
     assert followed.kind == "healthy"
     assert followed.segments[0].deviation == pytest.approx(alone.segments[0].deviation, rel=1e-3)
@@ -171,3 +184,9 @@ def test_hours_find_what_minutes_do() -> None:
     verdict = judge(healthy(), hour)
     assert [set(state) for state in states(verdict)] == [set(), {"payload"}, set()]
     assert [s.begin_s[1] for s in verdict.segments[1:]] == pytest.approx([2050.0, 2062.0], abs=1.0)
+
+
+def test_louder_noise_from_some_time_on_changes_no_coefficient() -> None:
+    calm, rng = recorded(26), np.random.default_rng(0)
+    noise = np.where(calm.t < 50.0, 0.0, 20.0) * rng.standard_normal(calm.samples)
+    assert judge(healthy(), equations().sums(replace(calm, u=calm.u + noise))).kind == "healthy"

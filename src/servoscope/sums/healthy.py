@@ -30,6 +30,7 @@ class Healthy:
     between: FloatArray  # and of recordings
     inflation: float  # of the covariance of long stretches, for neighbouring blocks err alike
     degrees: float  # of freedom that `between` is known with
+    unexplained: float  # mean of `Sums.unexplained`: where a block has more, its noise is louder than `kappa` says
     moments: FloatArray  # inverse of the moments of the covariates, shape (m, m)
     left_out: tuple[float, ...] = ()  # evidence of each healthy recording when it is left out of learning
     limit: float = 0.0  # of the evidence
@@ -45,7 +46,8 @@ class Healthy:
     def information(self, sums: Sums, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return information (K, p, p) and score (K, p) of each block about coefficients (p,)."""
         A, g = sums.A, sums.c - sums.A @ theta
-        V = self.kappa * A + A @ self.between_blocks @ A
+        louder = np.maximum(sums.unexplained / self.unexplained, 1.0)
+        V = self.kappa * louder[:, None, None] * A + A @ self.between_blocks @ A
         V += np.diag(1e-9 * np.diag(V.mean(axis=0)) + np.finfo(np.float64).tiny)
         solved = np.linalg.solve(V, np.concatenate([A, g[..., None]], axis=2)) / self.inflation
         M = A @ solved[..., :-1]

@@ -51,10 +51,11 @@ def _fitted(equations: Equations, sums: Sequence[Sums], unit: FloatArray | None 
     scores = np.concatenate([s.c - s.A @ fit for s, fit in zip(sums, own, strict=True)])
     kappa, between_blocks = block_noise(np.concatenate([s.A for s in sums]), scores, unit, len(sums))
     p, m = len(theta), len(sums[0].x)
+    left = np.concatenate([s.unexplained for s in sums])
+    unexplained = float(left.sum() / max(np.count_nonzero(left), 1)) + np.finfo(np.float64).tiny
     floor = np.diag(floor_variance(unit))
-    healthy = Healthy(
-        equations, theta[:, None] * np.eye(1, m), unit, kappa, between_blocks, floor, floor, 1.0, 1.0, np.zeros((m, m))
-    )
+    theta, none = theta[:, None] * np.eye(1, m), np.zeros((m, m))
+    healthy = Healthy(equations, theta, unit, kappa, between_blocks, floor, floor, 1.0, 1.0, unexplained, none)
     healthy = replace(healthy, inflation=_inflation(healthy, sums, own))
     healthy = _with_recordings(replace(healthy, within=_within(healthy, sums, own)), sums)
     free = np.isin(np.arange(p), equations.free)

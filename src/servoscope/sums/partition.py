@@ -24,8 +24,8 @@ class Stretch(NamedTuple):
 
     @property
     def inside(self) -> int:
-        """The first block after those within which the change before came."""
-        return self.begin + (min(CHANGE_BLOCKS, self.end - self.begin - 1) if self.begin else 0)
+        """The first block after those within which the change before came; `end` where there is none."""
+        return min(self.begin + CHANGE_BLOCKS, self.end) if self.begin else 0
 
 
 class Partition(NamedTuple):
@@ -40,17 +40,22 @@ def running_sums(a: FloatArray) -> FloatArray:
     return np.concatenate([np.zeros_like(a[:1]), np.cumsum(a, axis=0)])
 
 
-def partition(M: FloatArray, w: FloatArray, prior: ChangePrior, cut: float, shortest: int) -> Partition:
+def partition(
+    M: FloatArray, w: FloatArray, prior: ChangePrior, cut: float, shortest: int, *, changes: bool = True
+) -> Partition:
     """Cut a recording where that explains it best; a cut costs `cut` nats, a stretch has `shortest` blocks or more.
 
-    M (K + 1, p, p) and w (K + 1, p) are running sums. Times of change are sought on a grid that is as fine as blocks
-    only around those found, and around short windows that look changed by themselves: hours cost what minutes do.
+    The last one may be shorter, for the recording may end at once after a change; then it is rather changed than
+    healthy, which so few blocks do not show. M (K + 1, p, p) and w (K + 1, p) are running sums. Times of change are
+    sought on a grid that is as fine as blocks only around those found, and around short windows that look changed by
+    themselves: hours cost what minutes do. Without `changes`, all stretches are healthy.
     """
     K = len(w) - 1
     step = max(1, -(-K // GRID))
-    grid = np.unique(np.concatenate([np.arange(0, K, step), _conspicuous_ends(M, w, prior, shortest), [K]]))
+    last = np.arange(max(K - shortest, 0), K + 1)
+    grid = np.unique(np.concatenate([np.arange(0, K, step), _conspicuous_ends(M, w, prior, shortest), last]))
     while True:
-        best = _best_on_grid(M, w, prior, cut, shortest, grid)
+        best = _best_on_grid(M, w, prior, cut, shortest, grid, changes=changes)
         finer = _refined(grid, [s.begin for s in best.stretches[1:]])
         if len(finer) == len(grid):
             return best
@@ -75,10 +80,10 @@ def _refined(grid: IntArray, cuts: list[int]) -> IntArray:
 
 
 def _best_on_grid(
-    M: FloatArray, w: FloatArray, prior: ChangePrior, cut: float, shortest: int, grid: IntArray
+    M: FloatArray, w: FloatArray, prior: ChangePrior, cut: float, shortest: int, grid: IntArray, *, changes: bool
 ) -> Partition:
-    shortest = min(shortest, int(grid[-1]))
-    first, last = np.nonzero(grid[None, :] - grid[:, None] >= shortest)
+    length = grid[None, :] - grid[:, None]
+    first, last = np.nonzero((length >= shortest) | ((length > 0) & (grid == grid[-1])))
     begin, end = grid[first], grid[last]
     healthy, changed = np.full((2, len(grid), len(grid)), -np.inf)
     healthy[first, last], changed[first, last] = prior.evidence(M[end] - M[begin], w[end] - w[begin])
@@ -90,6 +95,10 @@ def _best_on_grid(
         parts = prior.evidence(M[end[inner]] - M[at], w[end[inner]] - w[at])
         for table, part in zip((healthy, changed), parts, strict=True):
             table[rows, columns] = np.maximum(table[rows, columns], part + passed)
+    if changes:
+        healthy[length < shortest] -= 2.0 * prior.cost
+    else:
+        changed[:] = -np.inf
     single = np.maximum(healthy, changed) - cut
     best, previous = np.full(len(grid), -np.inf), np.zeros(len(grid), dtype=np.int64)
     best[0] = cut  # the first stretch needs no cut

@@ -74,6 +74,14 @@ class _Judgement:
             for B in (np.zeros(len(w)), self.effect(M, w))
         )
 
+    def with_healthy_cuts(self) -> float:
+        """Return the evidence of the best account whose stretches all are healthy, each with its own coefficients."""
+        M, w = self.M, self.w
+        return max(
+            self.gain(B) + partition(M, w - M @ B, self.prior, self.cut_cost, self.shortest, changes=False).evidence
+            for B in (np.zeros_like(w[-1]), self.effect(M[-1], w[-1]))
+        )
+
     def with_changes(self) -> _Account:
         """Return the best account with a change; where no time of change pays, the whole recording is changed."""
         whole, begin = self.of(0, self.blocks), self.of(0, max(self.blocks // 4, 1))
@@ -172,5 +180,7 @@ def sums_evidence(healthy: Healthy, sums: Sums) -> JudgeEvidence:
     # the limit stands for the odds of a change; of those of its time, only the choice among blocks is paid for
     odds = CHANGE_COST + (judgement.cut_cost - float(np.log(judgement.blocks)) if len(account.stretches) > 1 else 0.0)
     nats = account.evidence - judgement.without_change() + odds
+    if nats > healthy.limit:
+        nats = min(nats, account.evidence - judgement.with_healthy_cuts() + CHANGE_COST)
     stretches = judgement.states(account.stretches) if nats > healthy.limit else (Stretch(0, judgement.blocks, False),)
     return JudgeEvidence("sums", nats, judgement.segments(stretches), len(stretches) > 1)
