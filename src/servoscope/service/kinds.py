@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Mapping
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
@@ -10,6 +11,7 @@ from pydantic import ValidationError
 
 from servoscope.core.settings import Settings
 from servoscope.core.settings_errors import describe_error
+from servoscope.service import publishers
 
 SOURCES, PUBLISHERS = "servoscope.sources", "servoscope.publishers"  # groups of entry points
 BUILT_IN = tuple(  # written like the entry points of other packages, and loaded like them: when a kind is used
@@ -22,6 +24,11 @@ BUILT_IN = tuple(  # written like the entry points of other packages, and loaded
         (SOURCES, "kafka", "kafka.source:KafkaSourceSettings"),
         (PUBLISHERS, "mqtt", "mqtt.publisher:MqttPublisherSettings"),
         (PUBLISHERS, "opcua", "opcua.server:OpcuaServerSettings"),
+        *(  # each file there but those that they share
+            (PUBLISHERS, module.name.replace("_", "-"), f"publishers.{module.name}:OutletSettings")
+            for module in pkgutil.iter_modules(publishers.__path__)
+            if module.name not in ("base", "files")
+        ),
     )
 )
 S = TypeVar("S", bound=Settings)

@@ -14,6 +14,7 @@ from servoscope.arm.baseline import AnyBaseline, ArmBaseline
 from servoscope.baseline.records import Occasion
 from servoscope.core.messages import message, render
 from servoscope.core.verdict import VerdictKind
+from servoscope.diagnosis.checks import checks_of_fault
 from servoscope.isolation.candidate import FaultEstimate
 from servoscope.service.alarms import (
     FAULT_ALARM,
@@ -46,6 +47,8 @@ class AlarmStatus(_StatusRecord):
     priority: Priority | None = None
     cause: str = ""
     until: float | None = None  # end of its shelving [UTC s]
+    active: bool | None = None  # whether its condition is abnormal, whatever the state; None: of a version before 2.0
+    ne107: Ne107 | None = None  # status that it gives to its asset
 
 
 class Announcement(NamedTuple):
@@ -85,6 +88,7 @@ class AssetMetadata(_StatusRecord):
     units: tuple[str, ...] = ()  # of y and u
     coefficient_units: tuple[str, ...] = ()
     faults: dict[str, str] = {}  # what their names mean
+    checks: dict[str, tuple[str, ...]] = {}  # what to check on the machine: of the faults that are named now
     window_s: float | None = None  # what an examination covers
 
 
@@ -153,11 +157,13 @@ def asset_metadata(baseline: AnyBaseline, group: str, window_s: float, source: s
     kind: dict[str, Any] = {"plant": "arm", "faults": {name: name for name in baseline.fault_names}}
     if isinstance(baseline, ArmBaseline):
         kind["coefficient_units"] = baseline.coefficient_units
+        kind["checks"] = {name: tuple(map(render, baseline.checks(name))) for name in baseline.fault_names}
     else:
         plant = baseline.loop.plant
         units = {"units": tuple(plant.units), "coefficient_units": tuple(plant.coefficient_units)}
         faults = {fault.name: fault.words for fault in plant.all_faults}
-        kind = {"plant": plant.kind, "point": baseline.point or None, "faults": faults, **units}
+        checks = {name: tuple(map(render, checks_of_fault(baseline.loop, name))) for name in faults}
+        kind = {"plant": plant.kind, "point": baseline.point or None, "faults": faults, "checks": checks, **units}
     return AssetMetadata(
         group=group,
         source=source,
@@ -224,7 +230,8 @@ def asset_status(
 ) -> dict[str, Any]:
     """Return the status of an asset as stored, an `AssetStatus`, whose values are checked where it is read.
 
-    `metadata`: as stored; `announced`: after which it learns again; `kept_s`: how long samples are kept.
+    `metadata`: as `asset_metadata` returns it; `announced`: after which it learns again; `kept_s`: how long samples
+    are kept.
     """
     examination, findings = state.examination, quality.active_findings(state.quality)
     now = quality.limit_verdict(examination.verdict, findings)
@@ -235,6 +242,8 @@ def asset_status(
     if verdict == "fault" and now != "fault":
         fault = named or render(message("service.examination.seen"))
         summary = render(message("service.examination.stands", fault=fault, t=examination.fault_at, since=summary))
+    known_checks = metadata.get("checks", {})
+    checks = {fault["name"]: known_checks.get(fault["name"], ()) for fault in examination.faults}
     learning = None
     if announced is not None:
         needed_s = min(MIN_LEARN_S, kept_s)
@@ -262,6 +271,8 @@ def asset_status(
                 # the cause at the last sample would be, once the fault has gone, that all is well
                 "cause": named if name == FAULT_ALARM and named else alarm.cause,
                 "until": alarm.shelved_until,
+                "active": alarm.active,
+                "ne107": definitions[name].ne107,
             }
             for name, alarm in state.alarms.items()
             if alarm.state is not LifecycleState.NORMAL
@@ -272,5 +283,6 @@ def asset_status(
         **({} if examination.diagnosed is None else {"diagnosed": examination.diagnosed}),
         **({} if outlook is None else {"outlook": outlook.model_dump(mode="json", exclude_unset=True)}),
         "counted": vars(state.position),
-        "about": metadata,
+        "about": {key: value for key, value in metadata.items() if key != "checks"}
+        | ({"checks": checks} if checks else {}),
     }

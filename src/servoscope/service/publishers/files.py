@@ -1,0 +1,71 @@
+"""Publishers that keep files in a folder, for systems that read files: written whole, and only when they change."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from servoscope.core.errors import OutputError
+from servoscope.core.files import atomic_write, make_folder
+from servoscope.core.settings import NonEmptyStr, Positive
+from servoscope.service.publishers.base import PublisherSettings, StatusByAsset
+
+
+class FilesSettings(PublisherSettings):
+    """The keys of all outlets that keep files."""
+
+    path: NonEmptyStr  # the folder, made if it does not exist
+    every_s: Positive = 10.0  # time between two looks for what has changed [s]
+
+
+class FilesPublisher:
+    """Keeps the files that `render` returns, from a thread of its own."""
+
+    def __init__(self, folder: Path, every_s: float) -> None:
+        self._folder, self._every_s = folder, every_s
+        self._statuses: dict[str, Mapping[str, Any]] = {}
+        self._written: dict[str, bytes] = {}
+        self._lock, self._stopping = threading.Lock(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="files", daemon=True)
+        self.trouble = ""  # why the files are not up to date
+
+    def render(self, statuses: StatusByAsset) -> Mapping[str, bytes]:
+        """Return the contents of all files by name; `statuses`: of assets alone."""
+        raise NotImplementedError
+
+    def open(self, statuses: StatusByAsset) -> None:
+        """Write what the store holds; raises OutputError if the folder cannot be made."""
+        make_folder(self._folder)
+        self.publish(statuses)
+        self._write()
+        self._thread.start()
+
+    def publish(self, statuses: StatusByAsset) -> None:
+        """Take what has been stored."""
+        with self._lock:
+            self._statuses |= {name: status for name, status in statuses.items() if "verdict" in status}
+
+    def _run(self) -> None:
+        while not self._stopping.wait(self._every_s):
+            self._write()
+
+    def _write(self) -> None:
+        with self._lock:
+            statuses = dict(self._statuses)
+        try:
+            for name, content in self.render(statuses).items():
+                if self._written.get(name) != content:
+                    atomic_write(self._folder / name, content)
+                    self._written[name] = content
+            self.trouble = ""
+        except OutputError as error:  # a full disk, a share that is away: the next look tries again
+            self.trouble = str(error)
+
+    def close(self) -> None:
+        """Write what is left, and stop."""
+        self._stopping.set()
+        if self._thread.is_alive():
+            self._thread.join()
+            self._write()
