@@ -49,6 +49,7 @@ class Housekeeping:
         try:
             if self._service.writer.unavailable_since is None:
                 self._take_announcements()
+                self._service.store_requests()
                 self._execute_commands()
                 self._delete_old_rows()
                 self._thin_sizes()

@@ -14,6 +14,7 @@ from servoscope.service.build import ServiceComponents
 from servoscope.service.clock import SteadyClock
 from servoscope.service.config import ServiceFile
 from servoscope.service.log import log
+from servoscope.service.publishers.base import AlarmCommand
 from servoscope.service.writer import StoreWriter
 
 
@@ -62,6 +63,13 @@ class ServiceParts:
                 self.writer.add(self.config.name, rows)
         details = {"diagnosis": examination.summary, "onset": examination.onset}
         self.writer.add(self.config.name, self.notifier.notify(result.transitions, details, now))
+
+    def store_requests(self) -> None:
+        """Store what operators have commanded at the systems that show alarms; it is executed like other commands."""
+        for publisher in self._publishers.values():
+            for request in getattr(publisher, "take_requests", list[AlarmCommand])():
+                words = request.who, request.asset, request.alarm, request.command
+                self.store.add_command(*words, reason=request.reason, for_s=request.for_s)
 
     @property
     def troubles(self) -> dict[AlarmSource, Mapping[str, str]]:

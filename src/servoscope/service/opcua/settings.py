@@ -102,6 +102,11 @@ def import_asyncua() -> Any:
     return asyncua
 
 
+def import_ua() -> Any:
+    """Return the library's module of the standard's types; raises ConfigError if it is missing."""
+    return import_asyncua().ua
+
+
 def check_files(folder: Path, *names: str | None) -> None:
     """Check that these files exist; raises ConfigError if one does not."""
     for name in names:

@@ -4,15 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 from servoscope.core.settings import Settings
 
 StatusByAsset = Mapping[str, Mapping[str, Any]]  # by asset, and by the name of the service: what `watch --json` shows
 
 
+class AlarmCommand(NamedTuple):
+    """What an operator commands an alarm at the system that shows it, executed and audited like any other command."""
+
+    asset: str  # or the name of the service
+    alarm: str
+    command: str  # one of `COMMANDS`
+    who: str
+    reason: str = ""
+    for_s: float | None = None  # how long to shelve [s]
+
+
 class StatusPublisher(Protocol):
-    """Shows how assets are now, not what has happened: who missed a status reads the next one."""
+    """Shows how assets are now, not what has happened: who missed a status reads the next one.
+
+    One that takes commands has `take_requests`, which returns each `AlarmCommand` once; one that can be cut off has
+    `trouble`, in words.
+    """
 
     def open(self, statuses: StatusByAsset) -> None:
         """Start with what the store holds; raises ConfigError or SourceError if that is impossible."""
