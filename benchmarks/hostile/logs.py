@@ -176,7 +176,7 @@ def drawn_loop(rng: Generator) -> dict[str, Any]:
     values = (0, -1, 1e-9, 1e9, float("nan"), float("inf"), "", "text", True, [], [1.0], {}, None, "akf", "foh", 3, 0.5)
     for _ in range(int(rng.integers(1, 4))):
         name = str(rng.choice(["plant", "monitor", "columns", "controller"]))
-        table = settings[name] if rng.random() < 0.7 else settings
+        table = settings.get(name) if rng.random() < 0.7 else settings
         if not isinstance(table, dict):
             continue
         keys = [*table, "model_error", "rest_speed", "estimator", "update_when", "input", "unknown"]

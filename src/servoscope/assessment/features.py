@@ -161,8 +161,10 @@ def _steady_share(u: FloatArray, y: FloatArray) -> float:
 def _tails(x: FloatArray) -> float:
     """Return ln of the kurtosis: 0 of a square wave, 0.4 of a sine, 1.1 of Gaussian noise, more of rare jumps."""
     x = x - x.mean()
-    power = float(np.mean(np.square(x)))
-    return float(np.clip(np.log(np.mean(x**4) / power**2), 0.0, 4.0)) if power > 0.0 else 0.0
+    if not (largest := float(np.abs(x).max())) > 0.0:
+        return 0.0
+    x = x / largest  # the fourth power of a signal may be more than a number holds
+    return float(np.clip(np.log(np.mean(x**4) / np.mean(np.square(x)) ** 2), 0.0, 4.0))
 
 
 def _damping(e: FloatArray, period: float) -> float:
