@@ -45,6 +45,7 @@ LIBRARIES = (
     "scipy.io",
 )  # what most readers use; Arrow looks for pandas at its first array
 
+TEXT_LIBRARIES = ("pyarrow", "pyarrow.csv", "pyarrow.parquet")  # what most logs need: loading counts for no file
 TABLE_KEY = b"table"  # of the metadata of a batch
 ERRORS = {
     kind.__name__: kind for kind in (EmptyRecordingError, NotEnoughError, IrregularTimeError, LoopError, OutputError)
@@ -78,7 +79,7 @@ def run_restricted(
     kept = _kept[readable].name
     scratch = Path(kept) / uuid4().hex  # removed whatever becomes of the process
     sandbox = Sandbox(read=tuple(map(str, readable)), write=(kept,))
-    libraries = (__name__, task.partition(":")[0])
+    libraries = (__name__, task.partition(":")[0], *TEXT_LIBRARIES)
     timeout_s = BASE_S + size / BYTES_PER_S
     try:
         scratch.mkdir()
