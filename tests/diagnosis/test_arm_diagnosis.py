@@ -88,7 +88,7 @@ def test_a_simulated_arm(simulated: tuple[ArmBaseline, Read], tmp_path: Path) ->
     (tmp_path / "first.json").write_text(text.replace('"version": 2', '"version": 1'))
     first = ArmBaseline.load(tmp_path / "first.json")
     assert first is not None and first.loop.curve_speed == 0.0  # the friction of version 1 is a straight line
-    with pytest.raises(BaselineError, match="baseline of an arm"):
+    with pytest.raises(BaselineError, match="baseline of kind 'arm'"):
         Baseline.load(tmp_path / "arm.json")
 
 
@@ -307,7 +307,7 @@ def test_the_commands_take_an_arm(tmp_path: Path) -> None:
     gain = loop.joints["base_yaw"].gain  # of efforts in N m; the load determines it within 0.2
     assert loop.gains == "load" and gain != 1.0 and gain == pytest.approx(1.0, abs=0.4)
     refused = run(app, ["diagnose", str(tmp_path / "arm.json"), *logs, "--from", "3"])
-    assert refused.exit_code == 2 and "not for an arm" in refused.output
+    assert refused.exit_code == 2 and "no meaning for kind 'arm'" in refused.output
 
 
 def test_a_load_of_known_mass_gives_the_drive_gains(ur10e: tuple[ArmBaseline, Callable[[str], ArmRecording]]) -> None:

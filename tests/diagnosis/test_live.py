@@ -314,7 +314,7 @@ class TestAsset:
         for block in blocks(halls.recorded(3, halls.LEAK, grown, seconds=400.0)):
             followed.process(block)
             for window, seen in followed.due_diagnoses():
-                said = diagnose_blocks(followed.baseline, "press", seen)
+                said = diagnose_blocks(followed.machine, "press", seen)
                 (fault,) = said.document["faults"]
                 told.append((window.until - BEGAN, followed.is_news(window, said), fault["ratio"]))
                 row = followed.apply_diagnosis(window, said).rows[0]

@@ -14,9 +14,9 @@ from commands import run
 from servoscope.arm.simulation import simulate_arm
 from servoscope.fleet import Lake, Plan
 from servoscope.fleet import run as run_fleet
-from servoscope.fleet.arm_day import cut_windows
 from servoscope.fleet.rows import MICRO, Rows
 from servoscope.fleet.tasks import local
+from servoscope.fleet.window_day import cut_windows
 
 pytestmark = pytest.mark.slow
 
@@ -61,9 +61,11 @@ def test_what_a_lake_of_arms_cannot_be_is_refused_in_one_line(lake: Path) -> Non
     common = "fleet", str(lake / "lake"), "-o", str(lake / "refused")
     (lake / "arm.toml").write_text('kind = "arm"\nurdf = "x"\nsample_rate = 100.0\n')
     learned = run(*common, "--loop", lake / "arm.toml")
-    assert learned.code == 1 and "describes an arm" in learned.err and learned.err.count("\n") == 1
+    assert learned.code == 1 and "describes a machine of kind 'arm'" in learned.err and learned.err.count("\n") == 1
     named = run(*common, "--baselines", lake / "arm.json", "--columns", "r=q1, u=i1, y=q1", "--jobs", 1)
-    assert "an arm has no operating points and no --columns" in " ".join((named.out + named.err).split())
+    assert "--columns: leave out, the loop file of kind 'arm' names its columns" in " ".join(
+        (named.out + named.err).split()
+    )
 
 
 def test_windows_follow_each_other_whatever_the_blocks_are() -> None:

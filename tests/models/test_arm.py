@@ -12,11 +12,12 @@ import pytest
 from servoscope.arm.dynamics import torque_regressor
 from servoscope.arm.log import read_arm_log
 from servoscope.arm.model import ArmModel
-from servoscope.arm.settings import ArmLoop, describes_arm
+from servoscope.arm.settings import ArmLoop
 from servoscope.arm.setup import propose_arm_loop
 from servoscope.arm.simulation import GAINS, URDF, simulated_arm
 from servoscope.arm.urdf import parse_urdf
 from servoscope.core.errors import LoopError, RecordingError
+from servoscope.machines.kinds import kind_of_loop_file
 from servoscope.models.loop import Loop
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "arm.npz"
@@ -115,8 +116,8 @@ def test_what_is_no_serial_arm_is_refused_in_one_line(text: str, words: str) -> 
 def test_other_commands_refuse_an_arm(tmp_path: Path) -> None:
     path = tmp_path / "arm.toml"
     path.write_text('kind = "arm"\n')
-    assert describes_arm(path)
-    with pytest.raises(LoopError, match="describes an arm, which learn and diagnose take"):
+    assert kind_of_loop_file(path) == "arm"
+    with pytest.raises(LoopError, match="describes a machine of kind 'arm', which is no loop"):
         Loop.load(path)
 
 

@@ -96,7 +96,7 @@ def test_a_killed_service_asks_for_the_diagnosis_again(folder: Path) -> None:
     again = service_of(config)
     state = again.assets["cell"].state
     assert (
-        state is not None and state.examination.faults[0]["name"] == FRICTION and state.baseline == asset.baseline.hash
+        state is not None and state.examination.faults[0]["name"] == FRICTION and state.baseline == asset.machine.hash
     )
     due = find_due_prognosis(state, {FRICTION: 2.0}, 3600.0)
     assert due is not None and (due.fault, due.limit) == (FRICTION, 2.0)
@@ -129,11 +129,11 @@ def test_what_an_arm_cannot_be_is_refused_in_one_line(folder: Path) -> None:
         (
             replay,
             f'files = ["run.csv"]\nlimits = {{ "{FRICTION}" = "tracking" }}',
-            "not known of an arm, give a number",
+            "known of loops alone, give a number",
         ),
         (replay, 'files = ["run.csv"]\nlimits = { leakage = 1.5 }', "there is no fault of cell 'leakage'"),
         (rows, "", "depends on base_yaw.position, base_yaw.torque"),
-        (rows.replace("{asset}", "{asset}/{signal}"), "", "an arm needs all joints in one message"),
+        (rows.replace("{asset}", "{asset}/{signal}"), "", "needs all signals of its machine in one message"),
     ):
         with pytest.raises(ConfigError, match=why):
             check_service_file(ServiceFile.load(arm_hall(folder, "refused", source, more)))

@@ -225,7 +225,7 @@ def test_the_headline_of_a_leak_that_grows_is_its_newest_size() -> None:
     asset = Asset("press", halls.baseline(), Monitor(halls.baseline()), POLICY)
     rows = [row for block in blocks(2, "C_ie=1.2@10") for row in asset.process(block).rows]
     for window, part in asset.due_diagnoses(ended=True):
-        rows += asset.apply_diagnosis(window, diagnose_blocks(asset.baseline, "press", part)).rows
+        rows += asset.apply_diagnosis(window, diagnose_blocks(asset.machine, "press", part)).rows
     state = asset.state
     assert state is not None
     (size,), _ = AssetStatus.model_validate(asset.status(state)).newest_sizes

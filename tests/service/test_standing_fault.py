@@ -82,7 +82,7 @@ def leaky() -> Asset:
         t = BEGAN + recorded.t[rows] - recorded.t[0]
         asset.process(Block("press", k, np.asarray(t), recorded.r[rows], recorded.u[rows], recorded.y[rows]))
     for window, blocks in asset.due_diagnoses(ended=True):
-        asset.apply_diagnosis(window, diagnose_blocks(asset.baseline, "press", blocks))
+        asset.apply_diagnosis(window, diagnose_blocks(asset.machine, "press", blocks))
     return asset
 
 

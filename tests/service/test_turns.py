@@ -160,7 +160,7 @@ def test_whatever_happens_to_some_assets_all_come_to_what_they_come_to_alone(
         saved |= {each: pack_state(state) for each in changed if (state := together[each].state) is not None}
         if chance.random() < 0.3 and name in saved:  # killed: it goes on from its checkpoint and what came since
             killed, reception = together[name], together[name].reception
-            together[name] = Asset(name, killed.baseline, killed.monitor, POLICY)
+            together[name] = Asset(name, killed.machine, killed.monitor, POLICY)
             stored = [halls.stored_block(name, one) for one in found[name] if one.table == "recent"]
             groups = AssetGroups(together)
             left = together[name].resume(unpack_state(saved[name], name), stored[-80:])

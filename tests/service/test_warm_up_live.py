@@ -104,7 +104,7 @@ def test_the_last_minutes_are_compared_with_what_the_monitor_knows(baseline: ss.
     monitor, last = ss.Monitor(baseline), made.rows(slice(-2000, None))
     state, _ = monitor.run(monitor.init(), made.r, made.u, made.y, made.restart)
     blocks = [Block("rig", 0, BEGAN + last.t, last.r, last.u, last.y)]
-    carried = carry_covariates(baseline, blocks, monitor.covariate_history(state), BEGAN + last.t[-1])
+    carried = carry_covariates(baseline.logged_covariates, blocks, monitor.covariate_history(state), BEGAN + last.t[-1])
     assert [one.covariates.shape for one in carried] == [(3, 2000)]
     assert examine_blocks(baseline, "rig", blocks).verdict != "fault"
     for found in (examine_blocks(baseline, "rig", carried), diagnose_blocks(baseline, "rig", carried)):

@@ -41,7 +41,7 @@ def test_an_arm_and_its_log(chromium: Any, tmp_path: Path) -> None:
         assert asked(base, "/assets/cell/relearning") is None and asked(base, "/assets/cell/limits") == {"limits": []}
         repair = {"t": asset["t"], "text": "gear", "kind": "repair"}
         noted = httpx.post(f"{base}/api/v1/assets/cell/notes", json=repair, headers={"Origin": base})
-        assert noted.status_code == 409 and "an arm learns from logs" in noted.text
+        assert noted.status_code == 409 and "'arm' learns from logs" in noted.text
         (learned,) = asked(base, "/baselines")["baselines"]
         assert learned["columns"]["covariates"]["elbow.torque"] == "i3"
         assert asked(base, f"/baselines/{learned['id']}")["summary"]["joints"].keys() >= {"elbow"}
@@ -53,7 +53,7 @@ def test_an_arm_and_its_log(chromium: Any, tmp_path: Path) -> None:
             file = upload(client, "run.csv", (tmp_path / "run.csv").read_bytes()).json()
             wanted = {"upload": file["id"], "baseline": learned["id"]}
             request = DiagnosisRequest.model_validate({**wanted, "from_s": 10.0})
-            with pytest.raises(RecordingError, match="from_s: not for an arm, leave out"):
+            with pytest.raises(RecordingError, match="from_s: leave out"):
                 diagnose_file(lambda _: None, str(tmp_path / "run.csv"), request, str(tmp_path / "arm.json"), "", "")
             done = finished(client, client.post("/diagnoses", json=wanted))
             found = asked(base, f"/diagnoses/{done['result']['diagnosis']}")

@@ -7,7 +7,7 @@ import json
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, Self, TypeAlias
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, ValidationError
@@ -15,13 +15,13 @@ from pydantic import Field, ValidationError
 from servoscope.arm.model import FRICTION, ArmModel
 from servoscope.arm.regression import ANGLE_STEP, ArmSignals
 from servoscope.arm.settings import ArmLoop
-from servoscope.baseline.baseline import ARM_FORMAT, Baseline
 from servoscope.baseline.records import BaselineModel, BaselineSource, Matrix, Vector
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import BaselineError, LoopError
 from servoscope.core.files import atomic_write
-from servoscope.core.messages import Message, MessageText, message
+from servoscope.core.messages import MessageText
 
+ARM_FORMAT = "servoscope-arm-baseline"
 VERSION = 2
 HEAD_LENGTH = 200  # characters, in which a baseline says what it is
 UNKNOWN = "unknown"
@@ -165,11 +165,6 @@ class ArmBaseline(BaselineModel):
         return arm_causes(self.model)
 
     @property
-    def logged_covariates(self) -> tuple[str, ...]:
-        """Names of the signals that blocks of samples must have."""
-        return tuple(self.loop.channels)
-
-    @property
     def coefficient_units(self) -> tuple[str, ...]:
         """Units of the Coulomb friction, viscous friction and offset of each joint, which diagnoses estimate."""
         units = {False: ("N m", "N m s", "N m"), True: ("N", "N s/m", "N")}
@@ -180,16 +175,19 @@ class ArmBaseline(BaselineModel):
         """Names of the faults that may be found."""
         return tuple(dict.fromkeys(cause.name for cause in self.causes if cause.kind != UNKNOWN))
 
-    def checks(self, fault: str) -> tuple[Message, ...]:
-        """Return what to check on the arm for one of its faults."""
-        kind = fault.partition(" of ")[0]
-        known = any(cause.kind == kind for cause in self.causes)
-        return (message(f"arm.check.{kind.replace(' ', '_')}"),) if known else ()
-
     def save(self, path: str | Path) -> None:
         """Write the baseline as JSON; nothing half-written stays behind."""
+        atomic_write(Path(path), self.to_text().encode())
+
+    def to_text(self) -> str:
+        """Return the baseline as JSON, as `save` writes it."""
         content = {"format": ARM_FORMAT, "version": VERSION, **self.model_dump(mode="json", by_alias=True)}
-        atomic_write(Path(path), (json.dumps(content, indent=1) + "\n").encode())
+        return json.dumps(content, indent=1) + "\n"
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Return what `to_text` has written."""
+        return cls.model_validate({k: v for k, v in json.loads(text).items() if k not in ("format", "version")})
 
     @classmethod
     def load(cls, path: str | Path) -> Self | None:
@@ -217,14 +215,6 @@ class ArmBaseline(BaselineModel):
         except (ValidationError, LoopError) as error:
             raise BaselineError(f"{path}: damaged baseline, {str(error).splitlines()[0]}; learn it again") from None
         return baseline
-
-
-AnyBaseline: TypeAlias = Baseline | ArmBaseline
-
-
-def load_baseline(path: str | Path) -> AnyBaseline:
-    """Read a baseline, of a loop or of an arm; raises BaselineError if it cannot be used."""
-    return ArmBaseline.load(path) or Baseline.load(path)
 
 
 def loosen(information: FloatArray, names: Sequence[str], theta: FloatArray) -> FloatArray:

@@ -74,11 +74,11 @@ class ArmWindow(NamedTuple):
 def examine_window(baseline: ArmBaseline, name: str, t: FloatArray, signals: Mapping[str, FloatArray]) -> ArmWindow:
     """Examine one of the windows that follow each other without end; the limit is for one false alarm a year.
 
-    `t`: (N,) [s]; `signals`: by their names in `ArmBaseline.logged_covariates`, (N,) each. Evidence is a Bayes factor,
+    `t`: (N,) [s]; `signals`: by their names in `ArmLoop.channels`, (N,) each. Evidence is a Bayes factor,
     so that no more than 1/k of healthy windows pass a limit that is k times as high. Raises RecordingError if the
     samples cannot be used.
     """
-    if lacking := [signal for signal in baseline.logged_covariates if signal not in signals]:
+    if lacking := [signal for signal in baseline.loop.channels if signal not in signals]:
         raise RecordingError(f"{name}: has no {', '.join(lacking)}, name columns as in the loop file of the arm")
     whole = np.isfinite([t, *signals.values()]).all(axis=0)
     if not whole.any():

@@ -166,11 +166,3 @@ class ArmLoop(Settings):
         """Return G of motor angles = G q, (n, n), rows and columns in the order of the arm."""
         order = [list(self.joints).index(name) for name in arm.names]
         return np.eye(arm.size) if self.gears is None else np.array(self.gears)[np.ix_(order, order)]
-
-
-def describes_arm(path: str | Path) -> bool:
-    """Whether a file is the loop file of an arm; False where it cannot be read."""
-    try:
-        return parse_toml(Path(path).read_text(encoding="utf-8-sig"), path, LoopError).get("kind") == "arm"
-    except (OSError, ValueError, LoopError):
-        return False

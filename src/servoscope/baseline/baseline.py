@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -43,7 +44,7 @@ from servoscope.models.plants import Plant
 from servoscope.signals.recording import frame_of
 
 FORMAT = "servoscope-baseline"
-ARM_FORMAT = "servoscope-arm-baseline"  # what `ArmBaseline` writes
+OTHER_FORMAT = re.compile(r"servoscope-(\w+)-baseline")  # of machines that are no loops
 VERSION = 3
 SETTLED_MEMORIES = 3.0  # memories, after which 5 % of the start are left
 
@@ -366,9 +367,9 @@ class Baseline(ShortRepr, LearnedEvidence):
             raise BaselineError(
                 f"{path}: is not a baseline (no JSON); give the file that servoscope learn wrote"
             ) from None
-        if isinstance(content, Mapping) and content.get("format") == ARM_FORMAT:
+        if isinstance(content, Mapping) and (other := OTHER_FORMAT.fullmatch(str(content.get("format")))):
             raise BaselineError(
-                f"{path}: baseline of an arm, whose torques depend on all joints: diagnose, services and fleets take it"
+                f"{path}: baseline of kind {other[1]!r}, which is no loop: diagnose, services and fleets take it"
             )
         if not isinstance(content, Mapping) or content.get("format") != FORMAT:
             raise BaselineError(f"{path}: is not a baseline; give the file that servoscope learn wrote")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from servoscope.cli import arguments, arm
+from servoscope.cli import arguments, arm, machines
 from servoscope.cli.app import app
 from servoscope.cli.exit import FailureCounter
 from servoscope.cli.options import ReadingOptions, with_reading_options
@@ -43,7 +43,7 @@ def init(
     logs = arguments.expand_files(logs)
     check_output(output, "-o", (".toml",), logs)
     if urdf is not None:
-        arm.refuse_options(reading.given())
+        machines.refuse_options("arm", reading.given())
         arm.write_proposal(logs, urdf, output, yes)
         return
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servoscope.cli import arguments, arm
+from servoscope.cli import arguments, machines
 from servoscope.cli.app import app
 from servoscope.cli.arguments import RecordingReader
 from servoscope.cli.baseline import AfterOption, add_recordings
@@ -24,6 +24,7 @@ from servoscope.cli.options import (
 from servoscope.cli.output_paths import REPORTS, TRACES, OutputPaths, check_output
 from servoscope.cli.progress import StepProgress, show_steps
 from servoscope.core.messages import say
+from servoscope.machines.kinds import LOOP, kind_of_file, kind_of_loop_file, load_machine
 
 if TYPE_CHECKING:
     from servoscope.baseline.baseline import Baseline
@@ -166,15 +167,14 @@ def learn(
     alike = arguments.expand_baselines(population or [])
     check_output(output, "-o", (), [loop, *files, *alike, *filter(None, [compare])])
 
-    from servoscope.arm.settings import describes_arm
     from servoscope.cli.render import results
     from servoscope.report import plain_values
 
-    if describes_arm(loop):
+    if (kind := kind_of_loop_file(loop)) != LOOP:
         points = any(point for point, _ in named)
         options = {"--nominal": nominal, "--compare": compare, "--fault": fault, "--population": population}
-        arm.refuse_options({**options, "operating points": points, **reading.given()})
-        arm.learn_baseline(loop, [path for _, path in named], output, as_json)
+        machines.refuse_options(kind, {**options, "operating points": points, **reading.given()})
+        machines.learn_baseline(kind, loop, [path for _, path in named], output, as_json)
         return
     acceptance = {"accept_change": accept_change, "accept_delay": accept_delay, "force": force, "population": alike}
     failures = FailureCounter()
@@ -268,7 +268,6 @@ def diagnose(
     check_output(report, "--report", REPORTS, inputs, folder=True)
     check_output(trace, "--trace", TRACES, inputs, folder=True)
 
-    from servoscope.arm.baseline import ArmBaseline
     from servoscope.baseline.baseline import Baseline
     from servoscope.cli.render import diagnosis, results
     from servoscope.diagnosis.diagnose import diagnose as diagnose_recording
@@ -277,9 +276,9 @@ def diagnose(
     from servoscope.report import document, plain_values
     from servoscope.signals.writers import write_table
 
-    if (of_arm := ArmBaseline.load(baseline)) is not None:
-        arm.refuse_options({"--point": point, "--trace": trace, **reading.given()})
-        arm.diagnose_logs(of_arm, recordings, as_json, report, details)
+    if (kind := kind_of_file(baseline)) != LOOP:
+        machines.refuse_options(kind, {"--point": point, "--trace": trace, **reading.given()})
+        machines.diagnose_logs(load_machine(baseline), baseline, recordings, as_json, report, details)
         return
     whole = learned = Baseline.load(baseline)
     if point is not None:

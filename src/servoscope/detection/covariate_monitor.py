@@ -9,13 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from servoscope.baseline.baseline import Baseline
-from servoscope.baseline.covariates import CovariateAverage, CovariateModel
+from servoscope.baseline.covariates import CovariateAverage, CovariateModel, hold_last
 from servoscope.core.arrays import BoolArray, FloatArray
 from servoscope.core.errors import RecordingError
 from servoscope.core.messages import message
 from servoscope.detection.statistic import t2_statistic
 from servoscope.detection.trace import Trace
+from servoscope.detection.warm_up import COURSE_CHANNELS
 from servoscope.estimation.frequency_response import frequency_response
+from servoscope.signals import Recording, clean
 
 # of each covariate: how long before the last sample [s], ascending in time, and the values then; shape (m,) each
 CovariateHistory = Mapping[str, tuple[FloatArray, FloatArray]]
@@ -129,3 +131,27 @@ class CovariateMonitor:
             statistic=np.where(ready, t2_statistic(trace.theta, expected, C), 0.0),
             ready=ready,
         )
+
+
+def window_recording(baseline: Baseline, name: str, signals: FloatArray) -> tuple[Recording, float]:
+    """Return rows t, r, u, y and channels as a recording, whose time begins at 0, and the time of its beginning.
+
+    Raises RecordingError if they cannot be used as one.
+    """
+    t, r, u, y, *covariates = signals
+    names = baseline.logged_covariates if baseline.covariates is None or baseline.logged_covariates else COURSE_CHANNELS
+    told = {name: np.where(np.isfinite(c), c, np.nan) for name, c in zip(names, covariates, strict=False)}
+    hold_s, rate = baseline.loop.monitor.covariate_hold_s, baseline.loop.sample_rate
+    if (
+        baseline.covariates is not None
+        and (stale := baseline.covariates.describe_stale(told, hold_s, rate)) is not None
+    ):
+        raise RecordingError(str(stale))
+    # a thermometer may tell less often than the motion is sampled
+    channels = {name: hold_last(c[:, None], c[~np.isnan(c)][:1])[:, 0] for name, c in told.items()}
+    loop, start = baseline.loop, float(t[np.isfinite(t)][0]) if np.isfinite(t).any() else 0.0
+    limits = loop.input_limits
+    recording = clean(
+        t - start, r, u, y, name=name, sample_rate=loop.sample_rate, limits=limits, channels=channels or None
+    )
+    return recording, start

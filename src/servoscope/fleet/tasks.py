@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from servoscope.arm.baseline import ArmBaseline
 from servoscope.core.errors import NotEnoughError, ServoscopeError
 from servoscope.core.files import atomic_write, make_folder
 from servoscope.core.workers import Progress, WorkerError, Workers
@@ -18,6 +17,8 @@ from servoscope.fleet.day_monitor import DayMonitor, DayState, EvaluationBlock, 
 from servoscope.fleet.lake import POINT, AssetDay
 from servoscope.fleet.read import read_blocks
 from servoscope.fleet.rows import MICRO, Rows
+from servoscope.machines.kinds import LOOP, kind_of_file, load_cached
+from servoscope.machines.protocol import Machine
 from servoscope.models.loop import Columns, Loop
 from servoscope.signals import Recording
 
@@ -122,9 +123,9 @@ class ExamineTask:
         try:
             if self.baseline is None:
                 raise ServoscopeError(f"no baseline: {self.baseline_error}")
-            if (of_arm := ArmBaseline.load(self.baseline)) is not None:
-                return self._stamp(self._examine_arm(of_arm))
             point = dict(self.item.groups).get(POINT)
+            if kind_of_file(self.baseline) != LOOP:
+                return self._stamp(self._examine_windows(load_cached(Path(self.baseline)), point))
             monitor = load_day_monitor(self.baseline, self.assets, self.window_s, point)
             learned = monitor.baseline.loop.columns
             columns = self.columns if self.columns is not None else learned
@@ -139,12 +140,12 @@ class ExamineTask:
             result = failed_result(error)
         return self._stamp(result)
 
-    def _examine_arm(self, baseline: ArmBaseline) -> dict[str, Any]:
-        from servoscope.fleet.arm_day import examine_arm_day
+    def _examine_windows(self, machine: Machine, point: str | None) -> dict[str, Any]:
+        from servoscope.fleet.window_day import examine_windows
 
-        if self.columns is not None or POINT in dict(self.item.groups):
-            raise ServoscopeError("an arm has no operating points and no --columns: its loop file names its columns")
-        return examine_arm_day(baseline, self.item.files, self.window_s)
+        if self.columns is not None:
+            raise ServoscopeError(f"--columns: leave out, the loop file of kind {machine.kind!r} names its columns")
+        return examine_windows(machine if point is None else machine.at(point), self.item.files, self.window_s)
 
     def _stamp(self, result: Mapping[str, Any]) -> dict[str, Any]:
         return {"asset": self.item.asset, "day": self.item.day, "stamp": self.item.stamp, **result}

@@ -292,8 +292,9 @@ class Loop(ShortRepr, Settings):
         if not isinstance(mapping, Mapping):
             raise LoopError(f"{source}: must be a table of settings, found {type(mapping).__name__}")
         data = dict(mapping)
-        if data.get("kind") == "arm":
-            raise LoopError(f"{source}: describes an arm, which learn and diagnose take, and services its baseline")
+        if isinstance(kind := data.get("kind"), str):
+            taken = "learn and diagnose take it where its package is installed, services take its baseline"
+            raise LoopError(f"{source}: describes a machine of kind {kind!r}, which is no loop: {taken}")
         if isinstance(data.get("plant"), Mapping):
             data["plant"] = _parse_plant_table(data["plant"], source)
         try:

@@ -7,20 +7,20 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from servoscope.arm.baseline import AnyBaseline, ArmBaseline, load_baseline
-from servoscope.baseline.baseline import Baseline
 from servoscope.core.errors import BaselineError, ConfigError, LoopError
 from servoscope.core.settings_errors import suggest_name
 from servoscope.design.operating_limits import LimitKind, OperatingLimit, operating_limits
 from servoscope.diagnosis.monitor import Monitor
+from servoscope.machines.kinds import load_machine
+from servoscope.machines.protocol import Machine
 from servoscope.service.actions import CommandSettings, EmailSettings, WebhookSettings
 from servoscope.service.actions.settings import SINKS, Sink
-from servoscope.service.assets.arm_asset import ArmAsset
 from servoscope.service.assets.asset import Asset, AssetPolicy
 from servoscope.service.assets.examination import compile_examination
 from servoscope.service.assets.groups import AssetGroups
 from servoscope.service.assets.outlook import AssetLimits
 from servoscope.service.assets.records import TableRow
+from servoscope.service.assets.window_asset import WindowAsset
 from servoscope.service.config import ServiceFile
 from servoscope.service.notifications import Notifier
 from servoscope.service.publishers.base import StatusPublisher
@@ -137,25 +137,22 @@ def build_assets(config: ServiceFile) -> dict[str, Asset]:
         config.prognosis,
         assets=len(config.assets),
     )
-    files: dict[Path, AnyBaseline] = {}
-    shared: dict[tuple[Path, str | None], tuple[Baseline, Monitor]] = {}
+    files: dict[Path, Machine] = {}
+    shared: dict[tuple[Path, str | None], tuple[Machine, Monitor | None]] = {}
     resolved: dict[object, AssetLimits] = {}
     assets = dict[str, Asset]()
     for name, settings in config.assets.items():
         path, point = config.baseline_file(name), settings.point
         if path not in files:
             try:
-                files[path] = load_baseline(path)
+                files[path] = load_machine(path)
             except BaselineError as error:
                 raise ConfigError(f"[assets] {name}.baseline: {error}") from None
-        learned = files[path]
-        if isinstance(learned, Baseline) and (path, point) not in shared:
-            shared[path, point] = _follow_point(learned, point, name, path.name)
-        elif isinstance(learned, ArmBaseline) and point is not None:
-            raise ConfigError(f"[assets] {name}.point: {path.name}: an arm has no operating points, leave it out")
-        baseline: AnyBaseline = learned if isinstance(learned, ArmBaseline) else shared[path, point][0]
-        _check_covariates(config, name, baseline)
-        faults = baseline.fault_names
+        if (path, point) not in shared:
+            shared[path, point] = _follow_point(files[path], point, name, path.name)
+        machine, monitor = shared[path, point]
+        _check_carried(config, name, machine)
+        faults = machine.fault_words
         if settings.limits is None:
             limits = {fault: limit for fault, limit in config.prognosis.limits.items() if fault in faults}
         else:
@@ -163,54 +160,53 @@ def build_assets(config: ServiceFile) -> dict[str, Asset]:
             _check_names(f"[assets] {name}.limits", f"fault of {name}", limits, faults)
         asked = path, point, frozenset(limits.items())
         if asked not in resolved:  # many assets are of one loop
-            resolved[asked] = _resolve_limits(baseline, limits, name)
+            resolved[asked] = _resolve_limits(machine, limits, name)
         policy = replace(policy, limits=resolved[asked], pause_s=config.sources[settings.source].pause_s)
         place = settings.group, settings.source
-        if isinstance(learned, ArmBaseline):
-            assets[name] = ArmAsset(name, learned, policy, *place)
+        if monitor is None:
+            assets[name] = WindowAsset(name, machine, policy, *place)
         else:
-            assets[name] = Asset(name, *shared[path, point], policy, *place)
-    known = [fault for asset in assets.values() for fault in asset.baseline.fault_names]
+            assets[name] = Asset(name, machine, monitor, policy, *place)
+    known = [fault for asset in assets.values() for fault in asset.machine.fault_words]
     _check_names("[prognosis] limits", "fault", config.prognosis.limits, known)
-    for asset in {id(asset.baseline): asset for asset in assets.values()}.values():
+    for asset in {id(asset.machine): asset for asset in assets.values()}.values():
         asset.compile_kernels()
     kinds = {
-        monitor.lane_key or shared_baseline.loop.plant.kind: shared_baseline
-        for shared_baseline, monitor in shared.values()
+        monitor.lane_key or machine.kind: machine.loop_baseline
+        for machine, monitor in shared.values()
+        if monitor is not None
     }
-    for shared_baseline in kinds.values():
-        compile_examination(shared_baseline)  # one of each kind: its kernels are those of all others
+    for baseline in filter(None, kinds.values()):
+        compile_examination(baseline)  # one of each kind: its kernels are those of all others
     return assets
 
 
-def _follow_point(learned: Baseline, point: str | None, asset: str, file: str) -> tuple[Baseline, Monitor]:
-    """Return the baseline of an operating point, and its monitor; raises ConfigError if it has no such point."""
+def _follow_point(learned: Machine, point: str | None, asset: str, file: str) -> tuple[Machine, Monitor | None]:
+    """Return the machine at an operating point, and what follows it; raises ConfigError if it has no such point."""
     try:
-        baseline = learned if point is None else learned.at(point)
+        machine = learned if point is None else learned.at(point)
     except BaselineError as error:
         raise ConfigError(f"[assets] {asset}.point: {file}: {error}") from None
     try:
-        return baseline, Monitor(baseline)
+        return machine, machine.follower()
     except BaselineError as error:
-        if points := ", ".join(baseline.points):
+        if points := ", ".join(machine.points):
             raise ConfigError(f"[assets] {asset}.point: missing, {file} has {points}: choose one") from None
         raise ConfigError(f"[assets] {asset}.baseline: {file}: {error}") from None
 
 
-def _check_covariates(config: ServiceFile, name: str, baseline: AnyBaseline) -> None:
+def _check_carried(config: ServiceFile, name: str, machine: Machine) -> None:
     """Raise ConfigError if an asset's source does not carry what its baseline depends on."""
     asset = config.assets[name]
     source, key = config.sources[asset.source], config.sources[asset.source].asset_key
     apart = asset.nodes is not None and asset.nodes.block is None
     apart |= (payload := getattr(source, "payload", None)) is not None and payload.has_signal_names
-    if apart and isinstance(baseline, ArmBaseline):
-        raise ConfigError(f"[assets] {name}: an arm needs all joints in one message, which source {asset.source} lacks")
+    if apart and machine.needs_channels_alone:
+        raise ConfigError(
+            f"[assets] {name}: needs all signals of its machine in one message, which source {asset.source} lacks"
+        )
     address = getattr(asset, key) if key else None
-    lacking = [
-        logged_covariate
-        for logged_covariate in baseline.logged_covariates
-        if not source.carries(logged_covariate, address)
-    ]
+    lacking = [channel for channel in machine.channels if not source.carries(channel, address)]
     if lacking:
         where = (
             f"[assets.{name}] nodes.covariates"
@@ -223,15 +219,15 @@ def _check_covariates(config: ServiceFile, name: str, baseline: AnyBaseline) -> 
         )
 
 
-def _resolve_limits(baseline: AnyBaseline, limits: Mapping[str, float | LimitKind], asset: str) -> AssetLimits:
+def _resolve_limits(machine: Machine, limits: Mapping[str, float | LimitKind], asset: str) -> AssetLimits:
     """Return limits with what a loop loses in place of its name; raises ConfigError where no size takes that."""
     resolved: dict[str, float | OperatingLimit] = {}
     for fault, limit in limits.items():
         if not isinstance(limit, str):
             resolved[fault] = limit
             continue
-        if isinstance(baseline, ArmBaseline):
-            raise ConfigError(f'limits of {asset}: {fault} = "{limit}": not known of an arm, give a number')
+        if (baseline := machine.loop_baseline) is None:
+            raise ConfigError(f'limits of {asset}: {fault} = "{limit}": known of loops alone, give a number')
         try:
             operating_limit = next(
                 operating_limit
@@ -251,16 +247,16 @@ def _resolve_limits(baseline: AnyBaseline, limits: Mapping[str, float | LimitKin
 def source_assets(config: ServiceFile, assets: Mapping[str, Asset], source: str) -> dict[str, SourceAsset]:
     """Return what a source is told of its assets."""
     key = config.sources[source].asset_key
-    own = {name: assets[name].baseline for name, asset in config.assets.items() if asset.source == source}
+    own = {name: assets[name].machine for name, asset in config.assets.items() if asset.source == source}
     return {
         name: SourceAsset(
-            baseline.loop.carrier if isinstance(baseline, ArmBaseline) else baseline.loop,
+            machine.carrier,
             getattr(config.assets[name], key) if key else None,
             config.service.ahead_s,
-            baseline.logged_covariates,
-            is_arm=isinstance(baseline, ArmBaseline),
+            machine.channels,
+            alone=machine.needs_channels_alone,
         )
-        for name, baseline in own.items()
+        for name, machine in own.items()
     }
 
 
@@ -298,9 +294,9 @@ def check_actions(config: ServiceFile, assets: Mapping[str, Asset]) -> None:
         where = f"[actions] tolerance.{name}"
         _check_names(f"{where}.assets", "asset", fault_tolerance_settings.assets, assets)
         for asset in fault_tolerance_settings.assets:
-            baseline = assets[asset].baseline
-            learned = () if isinstance(baseline, ArmBaseline) else (fault.name for fault in baseline.learned)
-            faults = [*baseline.fault_names, *learned]
+            machine = assets[asset].machine
+            learned = machine.loop_baseline.learned if machine.loop_baseline is not None else ()
+            faults = [*machine.fault_words, *(fault.name for fault in learned)]
             _check_names(f"{where}.fault", f"fault of {asset}", [fault_tolerance_settings.fault], faults)
 
 

@@ -60,7 +60,7 @@ def listen(config: ServiceFile, seconds: float) -> list[CommissioningRow]:
             time.sleep(POLL_S)
         rows = []
         for name, asset in assets.items():
-            source_name, needed = config.assets[name].source, asset.baseline.loop.sample_rate
+            source_name, needed = config.assets[name].source, asset.machine.rate
             source = sources[source_name]
             reception = logs[name].evaluate(now, 2.0 * seconds, source.trouble, source.asset_troubles.get(name))
             if reception.state == "unheard" and source_name in strange and not reception.source_down:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any
 
-from servoscope.arm.baseline import AnyBaseline, ArmBaseline
-from servoscope.baseline.baseline import Baseline
 from servoscope.core.workers import WorkerError, Workers
 from servoscope.design.operating_limits import OperatingLimit
+from servoscope.machines.kinds import parse_machine
+from servoscope.machines.protocol import Machine
 from servoscope.prognosis.forecast import Prognosis
 from servoscope.service.assets.checkpoint import AssetState
 from servoscope.service.assets.examination import StoredDiagnosis, diagnose_blocks, undetermined
@@ -35,9 +34,9 @@ class DiagnosisWorker:
         self._workers = Workers()
         self._closed = False
 
-    def submit(self, baseline: AnyBaseline, name: str, blocks: Sequence[Block]) -> Future[StoredDiagnosis]:
+    def submit(self, machine: Machine, name: str, blocks: Sequence[Block]) -> Future[StoredDiagnosis]:
         """Ask for the diagnosis of a window."""
-        return self._executor.submit(self._diagnose, baseline, name, list(blocks))
+        return self._executor.submit(self._diagnose, machine, name, list(blocks))
 
     def submit_prognosis(self, store: Store, name: str, due: DuePrognosis) -> Future[Prognosis]:
         """Ask when a fault of an asset reaches its limit."""
@@ -56,8 +55,8 @@ class DiagnosisWorker:
         self._workers.close()
         self._executor.shutdown(wait=True, cancel_futures=True)
 
-    def _diagnose(self, baseline: AnyBaseline, name: str, blocks: list[Block]) -> StoredDiagnosis:
-        text = json.dumps(baseline.model_dump(mode="json", by_alias=True))
+    def _diagnose(self, machine: Machine, name: str, blocks: list[Block]) -> StoredDiagnosis:
+        text = machine.to_json()
         packed = [(block.sequence, block.pack()) for block in blocks]
         for _ in range(MAX_ATTEMPTS):
             try:
@@ -82,14 +81,13 @@ def find_due_prognosis(state: AssetState, limits: AssetLimits, every_s: float) -
 
 
 def diagnose_packed_blocks(
-    _: Callable[[str], None], baseline: str, name: str, packed: Sequence[tuple[int, bytes]]
+    _: Callable[[str], None], machine: str, name: str, packed: Sequence[tuple[int, bytes]]
 ) -> dict[str, Any]:
     """Diagnose a window in the worker's process."""
     blocks = [Block.unpack(name, *fields) for fields in packed]
-    return diagnose_blocks(_parse_baseline(baseline), name, blocks).model_dump(mode="json")
+    return diagnose_blocks(_parse_machine(machine), name, blocks).model_dump(mode="json")
 
 
 @lru_cache(MAX_CACHED_BASELINES)
-def _parse_baseline(text: str) -> AnyBaseline:
-    content = json.loads(text)
-    return (ArmBaseline if "urdf" in content else Baseline).model_validate(content)
+def _parse_machine(text: str) -> Machine:
+    return parse_machine(text)

@@ -107,7 +107,7 @@ def _keep_sources(
 def _identity(config: ServiceFile, assets: Mapping[str, Asset], name: str) -> tuple[Any, ...]:
     """Return all on which it depends how an asset is followed."""
     settings, asset = config.assets[name], assets[name]
-    return asset.policy, settings.group, settings.source, asset.baseline.model_dump_json()
+    return asset.policy, settings.group, settings.source, asset.machine.to_json()
 
 
 def _source_identity(config: ServiceFile, assets: Mapping[str, Asset], name: str) -> tuple[Any, ...]:

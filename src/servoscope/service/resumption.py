@@ -9,7 +9,6 @@ from collections.abc import Collection, Mapping
 from itertools import chain
 from typing import NamedTuple
 
-from servoscope.arm.baseline import ArmBaseline
 from servoscope.baseline.history import read_history
 from servoscope.core.errors import BaselineError, StateError
 from servoscope.service.assets.asset import Asset
@@ -104,11 +103,11 @@ def _is_renewed(config: ServiceFile, asset: Asset, state: AssetState, running: M
     Its history says so: it was put in force while nobody followed the asset. While the service runs, another baseline
     of an asset that it follows is in its file because somebody has written it there.
     """
-    if state.baseline == asset.baseline.hash:
+    if state.baseline == asset.machine.hash:
         return False
     if running is not None and asset.name in running:
         return True
-    if isinstance(asset.baseline, ArmBaseline):
+    if asset.machine.loop_baseline is None:
         return False
     path, point = config.baseline_file(asset.name), config.assets[asset.name].point
     try:

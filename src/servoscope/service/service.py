@@ -217,7 +217,7 @@ class Service(ServiceParts):
             if not asset.pending_diagnoses:
                 del self._awaiting[name]
             for window, blocks in asset.due_diagnoses(ended=ended, started=self._diagnosis_jobs):
-                self._diagnosis_jobs[name, window] = self._diagnosis_worker.submit(asset.baseline, name, blocks)
+                self._diagnosis_jobs[name, window] = self._diagnosis_worker.submit(asset.machine, name, blocks)
         for name, window in [key for key, job in self._diagnosis_jobs.items() if job.done()]:
             asset, diagnosis = self.assets[name], self._diagnosis_jobs.pop((name, window)).result()
             log("info", "diagnosis", asset=name, verdict=diagnosis.verdict, summary=diagnosis.summary)

@@ -8,17 +8,18 @@ from collections.abc import Iterable
 import sqlalchemy as sa
 from starlette.exceptions import HTTPException
 
-from servoscope.arm.baseline import AnyBaseline, ArmBaseline
 from servoscope.core.errors import BaselineError
-from servoscope.core.messages import Message, translate
+from servoscope.core.messages import translate
 from servoscope.diagnosis.change_words import fault_label
-from servoscope.diagnosis.checks import checks_of_fault, suspects
+from servoscope.diagnosis.checks import suspects
+from servoscope.machines.kinds import load_cached
+from servoscope.machines.protocol import Machine
 from servoscope.service.assets.status import AssetStatus
 from servoscope.service.store import Row, tables
 from servoscope.service.store.series import read_checks
 from servoscope.web.asset_document import has_open_fault
 from servoscope.web.dependencies import Context
-from servoscope.web.routes.baselines import asset_baseline_id, find_baseline, load_cached
+from servoscope.web.routes.baselines import asset_baseline_id, find_baseline
 from servoscope.web.schemas.responses import FaultCheck
 from servoscope.web.stored_diagnosis import read_diagnosis
 
@@ -37,31 +38,25 @@ def asset_checks(context: Context, asset: str, status: AssetStatus, row: Row | N
         return []
     diagnosis = read_diagnosis(row["document"]) if row is not None else None
     names = [fault.name for fault in status.faults] or (suspects(diagnosis.current) if diagnosis is not None else ())
-    checks = fault_checks(context, asset, asset_baseline(context, asset), names)
+    checks = fault_checks(context, asset, asset_machine(context, asset), names)
     if not any(check.texts for check in checks) and diagnosis is not None:  # its baseline is not here any more
         return [FaultCheck(fault="", label="", texts=[str(text) for text in diagnosis.checks])]
     return checks
 
 
-def fault_checks(context: Context, asset: str, baseline: AnyBaseline | None, names: Iterable[str]) -> list[FaultCheck]:
+def fault_checks(context: Context, asset: str, machine: Machine | None, names: Iterable[str]) -> list[FaultCheck]:
     """Return what to check on an asset for each of these faults."""
     own, checks = read_checks(context.store, asset), []
     for name in names:
         row = own.get(name, {})
-        texts = row.get("texts") or [str(text) for text in _known_checks(baseline, name)]
+        texts = row.get("texts") or [str(text) for text in (machine.checks(name) if machine is not None else ())]
         who = {"who": row["who"], "at": row["at"]} if row.get("texts") else {}
         checks.append(FaultCheck(fault=name, label=translate(fault_label(name)), texts=texts, **who))
     return checks
 
 
-def _known_checks(baseline: AnyBaseline | None, name: str) -> Iterable[Message]:
-    if isinstance(baseline, ArmBaseline):
-        return baseline.checks(name)
-    return () if baseline is None else checks_of_fault(baseline.loop, name)
-
-
-def asset_baseline(context: Context, asset: str) -> AnyBaseline | None:
-    """Return the baseline that an asset is compared with; None where it is not here."""
+def asset_machine(context: Context, asset: str) -> Machine | None:
+    """Return the machine that an asset is compared with; None where its baseline is not here."""
     id_ = asset_baseline_id(context, asset)
     if id_ is None:
         return None

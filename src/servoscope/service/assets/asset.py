@@ -11,14 +11,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from servoscope.arm.baseline import AnyBaseline
 from servoscope.core.errors import StateError
 from servoscope.core.messages import message, render
 from servoscope.diagnosis.schedule import DiagnosisSchedule
+from servoscope.machines.kinds import MachineSource, to_machine
 from servoscope.prognosis.forecast import Prognosis
 from servoscope.service.alarms import AlarmSettings, AlarmTransition, OperatorCommand
 from servoscope.service.assets.alarms import AssetAlarms
-from servoscope.service.assets.arm_monitor import AnyMonitor
 from servoscope.service.assets.block_lanes import BlockLanes, Followed
 from servoscope.service.assets.checkpoint import AssetState, StreamPosition, evolve
 from servoscope.service.assets.examination import StoredDiagnosis, carry_covariates, examine_blocks
@@ -33,6 +32,7 @@ from servoscope.service.assets.examination_schedule import (
     schedule_full_diagnosis,
     update_examination,
 )
+from servoscope.service.assets.idle_monitor import Follower
 from servoscope.service.assets.outlook import AssetLimits, Outlook, PrognosisSettings, single_fault
 from servoscope.service.assets.recent_blocks import PackedBlock, RecentBlocks
 from servoscope.service.assets.reception import RECEPTION_OK, Reception
@@ -75,23 +75,23 @@ class AssetPolicy:
 class Asset(StateHolder):
     """Follows one asset.
 
-    `baseline`: of one operating point; `monitor`: of it, shared; `group` and `source`, for users: what it belongs to.
+    `machine`: at one operating point; `monitor`: of it, shared; `group` and `source`, for users: what it belongs to.
     """
 
     def __init__(
         self,
         name: str,
-        baseline: AnyBaseline,
-        monitor: AnyMonitor,
+        machine: MachineSource,
+        monitor: Follower,
         policy: AssetPolicy,
         group: str = "",
         source: str = "",
     ) -> None:
         super().__init__()
-        self.name, self.baseline, self.policy, self.source = name, baseline, policy, source
-        self.monitor, self._rate, self._phase = monitor, baseline.loop.sample_rate, examination_phase(name)
+        self.name, self.machine, self.policy, self.source = name, to_machine(machine), policy, source
+        self.monitor, self._rate, self._phase = monitor, self.machine.rate, examination_phase(name)
         self._schedule = DiagnosisSchedule(policy.diagnosis.window_s, policy.diagnosis.after_s)
-        self._metadata = asset_metadata(baseline, group, policy.diagnosis.window_s, source)
+        self._metadata = asset_metadata(self.machine, group, policy.diagnosis.window_s, source)
         self._limits = policy.quality.limits(self._rate, policy.pause_s)
         self.lanes = BlockLanes(self._rate, self._limits, policy.residual_every_s)
         self.alarms = AssetAlarms(policy.alarms, policy.prognosis.ahead_s, limited=bool(policy.limits))
@@ -127,7 +127,7 @@ class Asset(StateHolder):
     def compile_kernels(self) -> None:
         """Compile what blocks need, so that the first one does not wait for it."""
         nothing, monitor = np.full(2, np.nan), self.monitor
-        channels = dict.fromkeys(self.baseline.logged_covariates, nothing)
+        channels = dict.fromkeys(self.machine.channels, nothing)
         monitor.run_lanes(monitor.init()[None], *(nothing,) * 3, channels=channels)
         quality.check_block(self._limits, quality.init_state(), np.arange(2.0), nothing, nothing, nothing)
 
@@ -137,10 +137,10 @@ class Asset(StateHolder):
         Returns those that were counted after the checkpoint, for `process`: they lead to nothing but the state after
         them. Raises StateError if it belongs to another baseline or layout.
         """
-        other = "belongs to another baseline" if state.baseline != self.baseline.hash else "is of another servoscope"
-        if state.baseline != self.baseline.hash or state.monitor.shape != self.monitor.init().shape:
+        other = "belongs to another baseline" if state.baseline != self.machine.hash else "is of another servoscope"
+        if state.baseline != self.machine.hash or state.monitor.shape != self.monitor.init().shape:
             raise StateError(
-                f"{self.name}: its saved state {other} ({state.baseline}, now {self.baseline.hash}): "
+                f"{self.name}: its saved state {other} ({state.baseline}, now {self.machine.hash}): "
                 f"run --anew {self.name} begins with a new state, behind the samples counted"
             )
         t = state.position.t
@@ -162,7 +162,7 @@ class Asset(StateHolder):
         alarms = before.alarms_now.items() if before is not None else ()
         self.state = AssetState(
             asset=self.name,
-            baseline=self.baseline.hash,
+            baseline=self.machine.hash,
             position=position,
             monitor=self.monitor.init(),
             quality=quality.init_state(),
@@ -291,7 +291,7 @@ class Asset(StateHolder):
 
     def _carry_covariates(self, blocks: Sequence[Block]) -> Sequence[Block]:
         history = self.monitor.covariate_history(self.take_state().monitor)
-        return carry_covariates(self.baseline, blocks, history, self.take_state().position.t)
+        return carry_covariates(self.machine.channels, blocks, history, self.take_state().position.t)
 
     def is_news(self, window: PendingDiagnosis, diagnosis: StoredDiagnosis) -> bool:
         """Return whether a full diagnosis is the first of its fault, or names others than the last one."""
@@ -370,7 +370,7 @@ class Asset(StateHolder):
             settings,
             t,
             state.evaluation.exceeded,
-            lambda: examine_blocks(self.baseline, self.name, self._carry_covariates(recent()), *details),
+            lambda: examine_blocks(self.machine, self.name, self._carry_covariates(recent()), *details),
             self._phase,
             sound=quality.limit_verdict("fault", quality.active_findings(state.quality)) == "fault",
         )

@@ -13,8 +13,8 @@ import numpy as np
 from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.detection.trace import Trace
 from servoscope.diagnosis.monitor import Monitor
-from servoscope.service.assets.arm_monitor import AnyMonitor
 from servoscope.service.assets.checkpoint import AssetState, evolve
+from servoscope.service.assets.idle_monitor import Follower
 from servoscope.service.assets.residual_history import (
     HistoryState,
     LastEvaluations,
@@ -110,7 +110,7 @@ class BlockLanes:
         self.timebase = Timebase(1.0 / rate)
 
     def follow(
-        self, monitor: AnyMonitor, state: AssetState, block: FloatArray, restart: bool, layers: LayerTimes
+        self, monitor: Follower, state: AssetState, block: FloatArray, restart: bool, layers: LayerTimes
     ) -> Followed:
         """Follow a block of one asset, in whatever order its samples are.
 
@@ -121,7 +121,8 @@ class BlockLanes:
         order.restart[:1] |= restart
         t, signals = block[0, order.rows], block[1:, order.rows]
         r, u, y, *covariates = np.where(np.isfinite(signals), signals, np.nan)
-        channels = dict(zip(monitor.baselines[0].logged_covariates, covariates, strict=False))
+        names = monitor.baselines[0].logged_covariates if isinstance(monitor, Monitor) else ()
+        channels = dict(zip(names, covariates, strict=False))
         layers.enter("kernel")
         new, trace = monitor.run_lanes(state.monitor[None], r, u, y, order.restart, channels=channels)
         layers.enter("quality")

@@ -10,19 +10,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from servoscope.arm.baseline import AnyBaseline, ArmBaseline
 from servoscope.baseline.baseline import Baseline
-from servoscope.baseline.covariates import hold_last
-from servoscope.core.errors import RecordingError, ServoscopeError
+from servoscope.core.errors import ServoscopeError
 from servoscope.core.messages import Message, message, render
 from servoscope.core.verdict import VerdictKind
-from servoscope.detection.covariate_monitor import CovariateHistory, fill_channels
-from servoscope.detection.warm_up import COURSE_CHANNELS
+from servoscope.detection.covariate_monitor import CovariateHistory, fill_channels, window_recording
 from servoscope.diagnosis.dates import TIMELINES
-from servoscope.diagnosis.result import Diagnosis
 from servoscope.isolation.candidate import FaultEstimate
+from servoscope.machines.kinds import MachineSource, to_machine
 from servoscope.service.sources.block import Block
-from servoscope.signals import Recording, clean
+from servoscope.signals import Recording
 
 if TYPE_CHECKING:  # its kernels are loaded when something is examined
     from servoscope.evidence.examination import Examination
@@ -85,7 +82,7 @@ def undetermined(key: str, **values: Any) -> StoredDiagnosis:
 
 
 def examine_blocks(
-    baseline: AnyBaseline,
+    machine: MachineSource,
     name: str,
     blocks: Sequence[Block],
     features: float | None = None,
@@ -102,8 +99,9 @@ def examine_blocks(
 
     Where the samples cannot be used, the verdict is ``undetermined`` and the headline has the reason.
     """
-    if isinstance(baseline, ArmBaseline):
-        return diagnose_blocks(baseline, name, blocks)
+    baseline = to_machine(machine).loop_baseline
+    if baseline is None:
+        return diagnose_blocks(machine, name, blocks)
     if assess:
         result = examine_blocks(baseline, name, blocks, features, fault, known)
         return result.model_copy(update={"control": _assess_blocks(baseline, name, blocks)})
@@ -185,19 +183,16 @@ def _follow_size(exam: Examination, fault: str, first: int) -> FaultEstimate | N
     return best.faults[0] if best.name == fault else None
 
 
-def diagnose_blocks(baseline: AnyBaseline, name: str, blocks: Sequence[Block]) -> StoredDiagnosis:
+def diagnose_blocks(machine: MachineSource, name: str, blocks: Sequence[Block]) -> StoredDiagnosis:
     """Diagnose a window, refit included, which takes seconds.
 
-    The motion signature before and after the onset is the document's key ``signature``; of an arm, ``evidence`` is that
-    of a change over its limit, and ``arm`` is how it is drawn. Times in the document count from the beginning
-    of the window, its key ``began``; those of the headline are dates, because months later nobody knows when the window
-    began.
+    What the machine adds to the diagnosis are further keys of the document. Times in the document count from the
+    beginning of the window, its key ``began``; those of the headline are dates, because months later nobody knows when
+    the window began.
     """
     try:
-        if isinstance(baseline, ArmBaseline):
-            diagnosis, start, details = _diagnose_arm(baseline, name, blocks)
-        else:
-            diagnosis, start, details = _diagnose_loop(baseline, name, blocks)
+        signals = np.concatenate([block.signals for block in blocks], axis=1)
+        diagnosis, start, _, details = to_machine(machine).judge_window(name, signals)
     except ServoscopeError as error:
         return undetermined("unusable", error=str(error))
     document = {**diagnosis.model_dump(mode="json"), "began": start, **details}
@@ -206,35 +201,14 @@ def diagnose_blocks(baseline: AnyBaseline, name: str, blocks: Sequence[Block]) -
     return StoredDiagnosis(verdict=diagnosis.verdict, headline=headline, onset=onset, document=document)
 
 
-def _diagnose_loop(baseline: Baseline, name: str, blocks: Sequence[Block]) -> tuple[Diagnosis, float, dict[str, Any]]:
-    from servoscope.diagnosis.diagnose import diagnose
-    from servoscope.diagnosis.motion_signature import signature_columns
-    from servoscope.diagnosis.verify import provenance
-
-    recording, start = blocks_to_recording(baseline, name, blocks)
-    diagnosis = diagnose(baseline, recording, before="suspect")  # the monitor has raised an alarm over minutes
-    diagnosis = diagnosis.model_copy(update={"provenance": provenance(baseline, recording)})
-    since = diagnosis.onset_s[1] if diagnosis.onset_s is not None else None
-    return diagnosis, start, {"signature": signature_columns(recording, baseline.loop, since)}
-
-
-def _diagnose_arm(baseline: ArmBaseline, name: str, blocks: Sequence[Block]) -> tuple[Diagnosis, float, dict[str, Any]]:
-    from servoscope.arm.diagnosis import examine_window
-
-    t, _, _, _, *signals = np.concatenate([block.signals for block in blocks], axis=1)
-    window = examine_window(baseline, name, t, dict(zip(baseline.logged_covariates, signals, strict=True)))
-    picture = window.examination.picture(baseline, window.diagnosis)
-    return window.diagnosis, window.start, {"evidence": window.excess, "arm": picture}
-
-
 def carry_covariates(
-    baseline: AnyBaseline, blocks: Sequence[Block], history: CovariateHistory, now: float
+    channels: Sequence[str], blocks: Sequence[Block], history: CovariateHistory, now: float
 ) -> Sequence[Block]:
     """Return blocks with what a monitor knows at `now` [UTC s] of covariates of which they have no value themselves."""
     if not history or not blocks:
         return blocks
     t, _, _, _, *rows = np.concatenate([block.signals for block in blocks], axis=1)
-    filled = fill_channels(dict(zip(baseline.logged_covariates, rows, strict=True)), t - now, history)
+    filled = fill_channels(dict(zip(channels, rows, strict=True)), t - now, history)
     columns = np.split(np.array(list(filled.values())), np.cumsum([block.t.size for block in blocks])[:-1], axis=1)
     return [replace(block, covariates=own) for block, own in zip(blocks, columns, strict=True)]
 
@@ -244,20 +218,4 @@ def blocks_to_recording(baseline: Baseline, name: str, blocks: Sequence[Block]) 
 
     Raises RecordingError if they cannot be used as one.
     """
-    t, r, u, y, *covariates = np.concatenate([block.signals for block in blocks], axis=1)
-    names = baseline.logged_covariates if baseline.covariates is None or baseline.logged_covariates else COURSE_CHANNELS
-    told = {name: np.where(np.isfinite(c), c, np.nan) for name, c in zip(names, covariates, strict=False)}
-    hold_s, rate = baseline.loop.monitor.covariate_hold_s, baseline.loop.sample_rate
-    if (
-        baseline.covariates is not None
-        and (stale := baseline.covariates.describe_stale(told, hold_s, rate)) is not None
-    ):
-        raise RecordingError(str(stale))
-    # a thermometer may tell less often than the motion is sampled
-    channels = {name: hold_last(c[:, None], c[~np.isnan(c)][:1])[:, 0] for name, c in told.items()}
-    loop, start = baseline.loop, float(t[np.isfinite(t)][0]) if np.isfinite(t).any() else 0.0
-    limits = loop.input_limits
-    recording = clean(
-        t - start, r, u, y, name=name, sample_rate=loop.sample_rate, limits=limits, channels=channels or None
-    )
-    return recording, start
+    return window_recording(baseline, name, np.concatenate([block.signals for block in blocks], axis=1))

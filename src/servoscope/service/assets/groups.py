@@ -12,8 +12,8 @@ import numpy as np
 from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
 from servoscope.core.errors import ServoscopeError
 from servoscope.diagnosis.monitor import Monitor
-from servoscope.service.assets.arm_monitor import AnyMonitor
 from servoscope.service.assets.asset import Asset
+from servoscope.service.assets.idle_monitor import Follower
 from servoscope.service.assets.recent_blocks import PackedBlock
 from servoscope.service.assets.records import NextBlock, StepResult, TableRow
 from servoscope.service.assets.states import AssetStates
@@ -72,7 +72,7 @@ class AssetGroups:
             if key is None or len(together) == 1:
                 continue
             monitors = dict.fromkeys(asset.monitor for asset in together if isinstance(asset.monitor, Monitor))
-            numbers: dict[AnyMonitor, int] = {monitor: i for i, monitor in enumerate(monitors)}
+            numbers: dict[Follower, int] = {monitor: i for i, monitor in enumerate(monitors)}
             for row, asset in enumerate(together):
                 self._places[asset.name] = _Place(asset, len(self._fleets), numbers[asset.monitor], row)
             states = AssetStates(len(together), len(together[0].monitor.init()))

@@ -10,12 +10,11 @@ from typing import Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from servoscope.arm.baseline import AnyBaseline, ArmBaseline
 from servoscope.baseline.records import Occasion
 from servoscope.core.messages import message, render
 from servoscope.core.verdict import VerdictKind
-from servoscope.diagnosis.checks import checks_of_fault
 from servoscope.isolation.candidate import FaultEstimate
+from servoscope.machines.protocol import Machine
 from servoscope.service.alarms import (
     FAULT_ALARM,
     AlarmDefinition,
@@ -152,26 +151,21 @@ def read_status(stored: Mapping[str, Any]) -> AssetStatus | ServiceStatus:
     return (ServiceStatus if stored.get("service") else AssetStatus).model_validate(stored)
 
 
-def asset_metadata(baseline: AnyBaseline, group: str, window_s: float, source: str = "") -> dict[str, Any]:
-    """Return the metadata of an asset with this baseline, as stored."""
-    kind: dict[str, Any] = {"plant": "arm", "faults": {name: name for name in baseline.fault_names}}
-    if isinstance(baseline, ArmBaseline):
-        kind["coefficient_units"] = baseline.coefficient_units
-        kind["checks"] = {name: tuple(map(render, baseline.checks(name))) for name in baseline.fault_names}
-    else:
-        plant = baseline.loop.plant
-        units = {"units": tuple(plant.units), "coefficient_units": tuple(plant.coefficient_units)}
-        faults = {fault.name: fault.words for fault in plant.all_faults}
-        checks = {name: tuple(map(render, checks_of_fault(baseline.loop, name))) for name in faults}
-        kind = {"plant": plant.kind, "point": baseline.point or None, "faults": faults, "checks": checks, **units}
+def asset_metadata(machine: Machine, group: str, window_s: float, source: str = "") -> dict[str, Any]:
+    """Return the metadata of an asset that is this machine, as stored."""
+    signals: dict[str, Any] = {} if machine.units is None else {"point": machine.point or None, "units": machine.units}
     return AssetMetadata(
         group=group,
         source=source,
-        loop=baseline.loop.name,
-        baseline=baseline.hash,
-        sample_rate_hz=baseline.loop.sample_rate,
+        loop=machine.name,
+        plant=machine.kind,
+        baseline=machine.hash,
+        sample_rate_hz=machine.rate,
+        coefficient_units=machine.coefficient_units,
+        faults=dict(machine.fault_words),
+        checks={name: tuple(map(render, machine.checks(name))) for name in machine.fault_words},
         window_s=window_s,
-        **kind,
+        **signals,
     ).model_dump(mode="json", exclude_unset=True)
 
 

@@ -74,11 +74,16 @@ def _plain_column(values: FloatArray) -> list[float | None]:
 
 
 def decode_block(
-    asset: str, message: bytes, received_at: float = 0.0, covariates: Sequence[str] = (), *, is_arm: bool = False
+    asset: str,
+    message: bytes,
+    received_at: float = 0.0,
+    covariates: Sequence[str] = (),
+    *,
+    alone: bool = False,
 ) -> Block:
     """Return the block of a message, binary or JSON, that came at `received_at` by the monotonic clock [s].
 
-    `covariates`: names of the further columns that it must have; without them, further columns are left out; `is_arm`:
+    `covariates`: names of the further columns that it must have; without them, further columns are left out; `alone`:
     JSON may leave out r, u and y, for which the first covariate stands. Memory is allocated for what is there, not for
     what a header announces. Raises MessageError if it is no block.
     """
@@ -86,7 +91,7 @@ def decode_block(
         return _decode_binary(asset, message, received_at, covariates)
     if message[:1] in (b"{", b" ", b"\n", b"\r", b"\t"):
         block = None if covariates else _decode_regular(asset, message, received_at)
-        return _decode_json(asset, message, received_at, covariates, is_arm=is_arm) if block is None else block
+        return _decode_json(asset, message, received_at, covariates, alone=alone) if block is None else block
     raise MessageError("not a block", f"begins with {message[:8]!r}: neither a binary block nor a JSON object")
 
 
@@ -157,7 +162,7 @@ def _decode_regular(asset: str, message: bytes, received_at: float) -> Block | N
 
 
 def _decode_json(
-    asset: str, message: bytes, received_at: float, covariates: Sequence[str], *, is_arm: bool = False
+    asset: str, message: bytes, received_at: float, covariates: Sequence[str], *, alone: bool = False
 ) -> Block:
     try:
         plain = parse_json(message)
@@ -177,7 +182,7 @@ def _decode_json(
         if not isinstance(named, dict) or not set(covariates) <= set(named):
             raise MessageError("covariates", f"covariates: missing, expected {', '.join(covariates)}")
         columns |= {f"covariates.{name}": named[name] for name in covariates}
-        columns = {**dict.fromkeys("ruy", named[covariates[0]]), **columns} if is_arm else columns
+        columns = {**dict.fromkeys("ruy", named[covariates[0]]), **columns} if alone else columns
     numbers = np.stack(_parse_columns(columns, ("r", "u", "y", *(f"covariates.{name}" for name in covariates))))
     if "t" in plain:
         (t,) = _parse_columns(plain, ("t",))
@@ -279,5 +284,5 @@ class BlockMessages(Decoder):
         asset = parse_asset(message.address)
         if asset not in self._assets:
             raise MessageError("unknown asset", f"{asset[:100]!r} is none of the assets of this source")
-        covariates, is_arm = self._assets[asset].covariates, self._assets[asset].is_arm
-        return Content(blocks=(decode_block(asset, message.content, message.at, covariates, is_arm=is_arm),))
+        covariates, alone = self._assets[asset].covariates, self._assets[asset].alone
+        return Content(blocks=(decode_block(asset, message.content, message.at, covariates, alone=alone),))

@@ -68,7 +68,7 @@ class SourceAsset(NamedTuple):
     address: Any
     ahead_s: float = math.inf  # how far its time stamps may be ahead of our clock [s]
     covariates: tuple[str, ...] = ()  # channels that its blocks carry beside r, u and y
-    is_arm: bool = False  # whether these are all that counts: messages need no r, u and y
+    alone: bool = False  # whether these are all that counts: messages need no r, u and y
 
 
 class InboxMessage(NamedTuple):

@@ -9,14 +9,9 @@ import json
 import math
 from collections.abc import Sequence
 from importlib.resources import files
-from itertools import chain, repeat
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from servoscope.arm.baseline import ArmBaseline
-from servoscope.arm.log import read_arm_log
 from servoscope.assessment.assess import assess
 from servoscope.assessment.tags import find_loops
 from servoscope.baseline.baseline import Baseline
@@ -24,18 +19,16 @@ from servoscope.baseline.comparison import compare_baselines
 from servoscope.core.errors import RecordingError
 from servoscope.core.workers import Progress
 from servoscope.design import design_study
-from servoscope.detection.trace import Trace
 from servoscope.diagnosis import operating_points
-from servoscope.diagnosis.diagnose import diagnose_with_trace
-from servoscope.diagnosis.motion_signature import signature_columns
 from servoscope.diagnosis.relearn import relearn
-from servoscope.diagnosis.result import Diagnosis
-from servoscope.estimation.frequency_response import ResponseRow, response_rows
 from servoscope.learning import inspection
 from servoscope.learning.proposal import init
+from servoscope.machines.kinds import load_machine
+from servoscope.machines.protocol import Machine
+from servoscope.machines.servo_loop import recording_columns
 from servoscope.models.loop import Columns, Loop
 from servoscope.report import plain_values
-from servoscope.report.downsample import downsample_indices, json_numbers, signal_columns
+from servoscope.report.downsample import json_numbers
 from servoscope.service.renewal import read_stretch
 from servoscope.signals import Recording, readers
 from servoscope.signals.readers.axes import moving_axes, signals_of_one_axis
@@ -136,7 +129,7 @@ def _inspection_result(result: inspection.Inspection, recording: Recording) -> J
         columns |= {"coherence_u": spectra.coherence_u, "coherence_y": spectra.coherence_y}
     return {
         "inspection": plain_values.to_plain_values(result),
-        "signals": _recording_columns(recording),
+        "signals": recording_columns(recording),
         "spectra": {name: json_numbers(values) for name, values in columns.items()} if columns is not None else None,
     }
 
@@ -145,54 +138,27 @@ def diagnose_file(
     progress: Progress, file: str, request: requests.DiagnosisRequest, baseline_file: str, name: str, out: str
 ) -> JsonObject:
     """Diagnose a recording with a baseline, for users `name`; data and report go into the folder `out`."""
-    from servoscope.report.diagnosis_page import write_diagnosis_page
-
-    if (of_arm := ArmBaseline.load(baseline_file)) is not None:
-        return _diagnose_arm(file, request, of_arm, name, Path(out))
-    baseline = Baseline.load(baseline_file)
-    baseline = baseline.at(request.point) if request.point is not None else baseline
-    recording = read_recording(file, baseline.loop, request)
-    progress("recursion")
-    diagnosis, trace = diagnose_with_trace(baseline, recording, progress)
+    machine = load_machine(baseline_file)
+    machine = machine.at(request.point) if request.point is not None else machine
+    judged = machine.judge(_read_selection(machine, file, request), progress)
     progress("report")
-    used = baseline.at(diagnosis.point) if diagnosis.point else baseline
-    origin = plain_values.provenance(used, Path(name), Path(file))
-    write_diagnosis_page(Path(out) / "report.html", diagnosis, trace, recording, used.loop, origin)
-    plant = used.loop.plant
-    data = {
-        "document": diagnosis.model_dump(mode="json"),
-        "words": {fault.name: fault.words for fault in plant.all_faults},
-        "units": plant.units,
-        "signals": _recording_columns(recording),
-        "trace": _trace_columns(trace, plant.coefficient_units),
-        "signature": signature_columns(recording, used.loop, diagnosis.onset_s[1] if diagnosis.onset_s else None),
-    }
-    return _keep_diagnosis(Path(out), diagnosis, data, used.hash)
-
-
-def _keep_diagnosis(out: Path, diagnosis: Diagnosis, data: JsonObject, used: str) -> JsonObject:
-    """Write what pages show of a diagnosis, by the baseline of this hash; return what lists show of it."""
+    judged.write_report(Path(out) / "report.html", name, file)
+    diagnosis = judged.diagnosis
+    data = {"document": diagnosis.model_dump(mode="json"), **judged.data}
     text = json.dumps(plain_values.replace_nan(data), allow_nan=False)
-    (out / "data.json").write_text(text, encoding="utf-8")
+    (Path(out) / "data.json").write_text(text, encoding="utf-8")
     kept = {"verdict": diagnosis.verdict, "summary": str(diagnosis.summary), "recording": diagnosis.recording}
-    return {**kept, "hash": used}
+    return {**kept, "hash": judged.hash}
 
 
-def _diagnose_arm(
-    file: str, request: requests.DiagnosisRequest, baseline: ArmBaseline, name: str, out: Path
-) -> JsonObject:
-    from servoscope.arm.diagnosis import examine_arm
-    from servoscope.arm.page import write_arm_page
-
-    refused = [key for key in ("point", "where", "from_s", "to_s") if getattr(request, key) not in (None, {})]
+def _read_selection(machine: Machine, file: str, request: requests.DiagnosisRequest) -> Any:
+    """Return what was asked for of a log; only those of loops have parts."""
+    if machine.loop_baseline is not None:
+        return read_recording(file, machine.carrier, request)
+    refused = [key for key in ("where", "from_s", "to_s") if getattr(request, key) not in (None, {})]
     if refused:
-        raise RecordingError(f"{', '.join(refused)}: not for an arm, leave out; its log is diagnosed as a whole")
-    recording = read_arm_log(file, baseline.loop, baseline.model.arm)
-    diagnosis, exam = examine_arm(baseline, recording)
-    write_arm_page(out / "report.html", diagnosis, exam, baseline)
-    document, arm = diagnosis.model_dump(mode="json"), exam.picture(baseline, diagnosis)
-    data = {"document": document, "words": {}, "units": ("", ""), "signals": None, "trace": None, "arm": arm}
-    return _keep_diagnosis(out, diagnosis, data, baseline.hash)
+        raise RecordingError(f"{', '.join(refused)}: leave out, a log of kind {machine.kind!r} is diagnosed as a whole")
+    return machine.read(file)
 
 
 def learn_baseline(
@@ -311,34 +277,3 @@ def read_recording(file: str, loop: Loop | None, selection: requests.RecordingSe
 def _merge_columns(mapping: requests.ColumnMapping, loop: Loop | None) -> Columns:
     base = loop.columns if loop is not None else Columns()
     return Columns.model_validate({**base.model_dump(), **mapping.to_update()})
-
-
-def _recording_columns(recording: Recording) -> dict[str, list[float | None]]:
-    return signal_columns(recording.t, (recording.r, recording.u, recording.y), SIGNAL_POINTS)
-
-
-def _trace_columns(trace: Trace, units: Sequence[str]) -> JsonObject:
-    """Return the evaluations as columns: tests, iFRF and coefficients, each beside what is healthy."""
-    excess = np.where(trace.ready, trace.statistic / trace.threshold, np.nan)
-    at = downsample_indices((excess, trace.level), TRACE_POINTS)
-    std = np.sqrt(np.maximum(np.diagonal(trace.covariance, axis1=1, axis2=2), 0.0))
-    rows = response_rows(trace.ifrf, trace.ifrf_expected, at)
-    tests = {"t": trace.t, "statistic": excess, "level": trace.level}
-    coefficients = {"value": trace.theta, "std": std, "nominal": trace.expected}
-    responses = [
-        {
-            "frequency_hz": f,
-            **{name: json_numbers(rows[:, i, k + 1]) for k, name in enumerate(ResponseRow._fields[1:5])},
-        }
-        for i, f in enumerate(trace.ifrf.frequencies.tolist())
-    ]
-    parameters = [
-        {
-            "name": name,
-            "unit": unit,
-            **{key: json_numbers(coefficient[at, i]) for key, coefficient in coefficients.items()},
-        }
-        for i, (name, unit) in enumerate(zip(trace.names, chain(units, repeat("")), strict=False))
-    ]
-    columns = {key: json_numbers(test[at]) for key, test in tests.items()}
-    return {**columns, "responses": responses, "parameters": parameters}

@@ -14,6 +14,7 @@ from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
 from servoscope.core.errors import BaselineError, LoopError, StoreError, StoreUnavailableError
 from servoscope.core.messages import say
 from servoscope.design.operating_limits import OperatingLimit, operating_limits
+from servoscope.machines.kinds import load_cached
 from servoscope.prognosis.forecast import prognose
 from servoscope.report.downsample import signal_columns
 from servoscope.service.asset_link import page_address, qr_code
@@ -24,9 +25,9 @@ from servoscope.service.store.queries import query_downsampled, query_history
 from servoscope.service.store.rows import CHECKS, NOTE
 from servoscope.service.store.series import FAULT_KINDS, query_sizes, read_notes, read_series, thin_columns
 from servoscope.web.asset_document import has_open_fault
-from servoscope.web.checks import asset_baseline, asset_checks, fault_checks, last_full_diagnosis
+from servoscope.web.checks import asset_checks, asset_machine, fault_checks, last_full_diagnosis
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
-from servoscope.web.routes.baselines import asset_baseline_id, find_baseline, load_cached, load_loop_baseline
+from servoscope.web.routes.baselines import asset_baseline_id, find_baseline, load_loop_baseline
 from servoscope.web.schemas import assets as schemas
 from servoscope.web.schemas import responses
 from servoscope.web.schemas.requests import (
@@ -179,11 +180,11 @@ def list_notes(context: ContextDep, asset: KnownAsset) -> responses.NoteList:
 @router.post("/assets/{asset}/notes", status_code=201)
 def add_note(context: ContextDep, who: Operator, asset: str, request: NoteRequest) -> responses.Note:
     """Note what was done to it."""
-    _, status = find_asset(context, asset)
-    if request.kind != NOTE and status.metadata.plant == "arm":
-        raise HTTPException(
-            409, f"{asset}: an arm learns from logs, and not from what the store keeps: use servoscope learn"
-        )
+    find_asset(context, asset)
+    machine = asset_machine(context, asset) if request.kind != NOTE else None
+    if machine is not None and machine.loop_baseline is None:
+        why = "learns from logs, and not from what the store keeps: use servoscope learn"
+        raise HTTPException(409, f"{asset}: kind {machine.kind!r} {why}")
     context.store.add_audit(who.user, asset, NOTE, request.model_dump())
     return responses.Note(who=who.user, **request.model_dump())
 
@@ -194,7 +195,7 @@ def write_checks(
 ) -> list[responses.FaultCheck]:
     """Write what to check on it for a fault, in words of one's own; the audit keeps who did, and what was there."""
     context.store.add_audit(who.user, asset, CHECKS, request.model_dump())
-    return fault_checks(context, asset, asset_baseline(context, asset), [request.fault])
+    return fault_checks(context, asset, asset_machine(context, asset), [request.fault])
 
 
 @router.get("/assets/{asset}/trend")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import shutil
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,10 @@ from typing import Any
 from fastapi import APIRouter, HTTPException, Response
 from fastapi.responses import FileResponse
 
-from servoscope.arm.baseline import AnyBaseline, ArmBaseline, load_baseline
 from servoscope.baseline.baseline import Baseline
+from servoscope.machines.kinds import load_cached
+from servoscope.machines.protocol import Machine
+from servoscope.machines.servo_loop import LoopMachine
 from servoscope.models.loop import Loop
 from servoscope.report import plain_values
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Engineer
@@ -78,41 +80,21 @@ def _saved_baseline(context: Context, record: responses.BaselineRecord) -> Basel
     return BaselineFile(path, responses.BaselineRow(name=record.id, origin="saved", **dict(record)))
 
 
-def _baseline_facts(baseline: AnyBaseline) -> responses.BaselineFacts:
-    if isinstance(baseline, ArmBaseline):
-        loop, points, units, sources = baseline.loop.carrier, tuple[str, ...](), None, list(baseline.sources)
-    else:
-        loop, points, units = baseline.loop, baseline.points, signal_units(baseline.loop.plant.units)
-        sources = [source for member in baseline.per_point for source in member.sources]
+def _baseline_facts(machine: Machine) -> responses.BaselineFacts:
     return responses.BaselineFacts(
-        loop=loop.name,
-        hash=baseline.hash,
-        points=list(points),
-        columns=loop.columns.model_dump(mode="json"),
-        units=units,
-        recordings=len(sources),
-        duration_s=sum(source.duration_s for source in sources),
+        loop=machine.name,
+        hash=machine.hash,
+        points=list(machine.points),
+        columns=machine.carrier.columns.model_dump(mode="json"),
+        units=signal_units(machine.units) if machine.units is not None else None,
+        recordings=len(machine.sources),
+        duration_s=sum(source.duration_s for source in machine.sources),
     )
 
 
 def load_loop_baseline(path: Path) -> Baseline:
-    """Return the baseline of a loop in a file; raises BaselineError if it is of an arm."""
-    baseline = load_cached(path)
-    return Baseline.load(path) if isinstance(baseline, ArmBaseline) else baseline
-
-
-def load_cached(path: Path) -> AnyBaseline:
-    """Return the baseline in a file, which is read again when it has changed."""
-    try:
-        stamp = path.stat().st_mtime_ns
-    except OSError:
-        stamp = 0  # loading has the better message
-    return _load_version(path, stamp)
-
-
-@lru_cache(maxsize=64)
-def _load_version(path: Path, _: int) -> AnyBaseline:
-    return load_baseline(path)
+    """Return the baseline of a loop in a file; raises BaselineError if it is of another machine."""
+    return load_cached(path).loop_baseline or Baseline.load(path)
 
 
 def resolve_loop(context: Context, ref: LoopRef) -> LoopRef:
@@ -139,8 +121,7 @@ def list_baselines(context: ContextDep) -> responses.BaselineList:
 def get_baseline(context: ContextDep, id: str) -> responses.BaselineDetail:
     """Return a baseline: what was learned, and which faults it can detect."""
     baseline_file = find_baseline(context, id)
-    baseline = load_cached(baseline_file.path)
-    summary: Any = baseline.summary() if isinstance(baseline, ArmBaseline) else plain_values.baseline_summary(baseline)
+    summary: Any = load_cached(baseline_file.path).summary()
     return responses.BaselineDetail(**dict(baseline_file.row), summary=plain_values.replace_nan(summary))
 
 
@@ -170,8 +151,8 @@ def list_loops(context: ContextDep) -> responses.LoopList:
     for name in EXAMPLES:
         text = files("servoscope.simulation").joinpath(f"{name}.toml").read_text(encoding="utf-8")
         rows.append(_loop_row({"example": name}, Loop.from_text(text, f"{name}.toml"), text))
-    loops = ((file.row.id, load_cached(file.path).loop) for file in _list_files(context))
-    rows += [_loop_row({"baseline": id_}, loop, None) for id_, loop in loops if isinstance(loop, Loop)]
+    learned = ((file.row.id, load_cached(file.path).loop_baseline) for file in _list_files(context))
+    rows += [_loop_row({"baseline": id_}, baseline.loop, None) for id_, baseline in learned if baseline is not None]
     return responses.LoopList(loops=rows)
 
 
@@ -216,7 +197,7 @@ async def start_learning(context: ContextDep, who: Engineer, request: LearningRe
 def save_baseline(context: ContextDep, who: Engineer, request: BaselineRequest) -> responses.BaselineRow:
     """Save a learned baseline under a name."""
     learned = context.storage.path(responses.LearningRow, request.learning) / "baseline.json"
-    facts = _baseline_facts(Baseline.load(learned))
+    facts = _baseline_facts(LoopMachine.load(learned))
     id_, folder = context.storage.create("baselines", request.name)
     try:
         shutil.copyfile(learned, folder / "baseline.json")

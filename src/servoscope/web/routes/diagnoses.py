@@ -19,7 +19,7 @@ from servoscope.service.assets.status import AssetMetadata
 from servoscope.service.store import tables
 from servoscope.service.store.queries import query_history
 from servoscope.service.store.series import read_checks
-from servoscope.web.checks import asset_baseline, fault_checks
+from servoscope.web.checks import asset_machine, fault_checks
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
 from servoscope.web.jobs.queue import Job
 from servoscope.web.middleware import API
@@ -123,11 +123,11 @@ def _asset_context(
     context: Context, asset: str, diagnosis: Diagnosis | None, facts: AssetMetadata | None
 ) -> DiagnosisContext:
     """Return what the diagnosis of an asset does not know itself."""
-    baseline, own = asset_baseline(context, asset), read_checks(context.store, asset)
+    machine, own = asset_machine(context, asset), read_checks(context.store, asset)
     names = suspects(diagnosis.current) if diagnosis is not None else ()
     checks = None
-    if baseline is not None or any(name in own for name in names):
-        checks = [text for check in fault_checks(context, asset, baseline, names) for text in check.texts]
+    if machine is not None or any(name in own for name in names):
+        checks = [text for check in fault_checks(context, asset, machine, names) for text in check.texts]
     if facts is None:
         return DiagnosisContext(checks=checks)
     coefficients = dict(

@@ -7,16 +7,16 @@ from functools import partial
 
 from fastapi import APIRouter, HTTPException
 
-from servoscope.arm.baseline import ArmBaseline
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.history import history_folder
+from servoscope.machines.kinds import load_cached
 from servoscope.service import renewal
 from servoscope.service.assets.status import AssetStatus
 from servoscope.service.config import ServiceFile
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Engineer
 from servoscope.web.jobs.queue import Job
 from servoscope.web.routes.assets import find_asset
-from servoscope.web.routes.baselines import load_cached, load_loop_baseline
+from servoscope.web.routes.baselines import load_loop_baseline
 from servoscope.web.schemas import responses
 from servoscope.web.schemas.requests import RelearningRequest, TakeRequest
 
@@ -44,7 +44,7 @@ def get_progress(context: ContextDep, asset: str) -> responses.RelearningState |
     (_, status), config = find_asset(context, asset), context.config
     if config is None or asset not in config.assets:
         return None
-    if isinstance(load_cached(config.baseline_file(asset)), ArmBaseline):
+    if load_cached(config.baseline_file(asset)).loop_baseline is None:
         return None  # what it learns from are whole logs of several days
     return _progress(context, config, asset, status)
 

@@ -1,4 +1,4 @@
-"""A day of an arm, diagnosed window by window: up to the first fault, or to its end."""
+"""A day of a machine that nothing follows, diagnosed window by window: up to the first fault, or to its end."""
 
 from __future__ import annotations
 
@@ -6,32 +6,37 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from servoscope.arm.baseline import ArmBaseline
-from servoscope.arm.diagnosis import examine_window
-from servoscope.core.errors import NotEnoughError
+import numpy as np
+
+from servoscope.core.errors import NotEnoughError, RecordingError
 from servoscope.core.messages import Message
 from servoscope.diagnosis.result import Diagnosis
 from servoscope.fleet.read import read_blocks
 from servoscope.fleet.rows import MICRO, Rows
+from servoscope.machines.protocol import Machine
 from servoscope.signals.readers.recording_file import MIN_EPOCH_S
 
 MIN_REST = 0.5  # of a window: a shorter rest of a day is no window of its own
 
 
-def examine_arm_day(baseline: ArmBaseline, files: Sequence[str], window_s: float) -> dict[str, Any]:
+def examine_windows(machine: Machine, files: Sequence[str], window_s: float) -> dict[str, Any]:
     """Return the result of a day as `day_result` does, without the evidence for causes that assets have in common.
 
     Raises RecordingError if a window cannot be used.
     """
     result: dict[str, Any] = {}
+    names = machine.channels
     first_us, samples, windows, peak = None, 0, 0, 0.0
-    for rows in cut_windows(read_blocks(files, baseline.loop.carrier.columns), round(window_s * MICRO)):
+    for rows in cut_windows(read_blocks(files, machine.carrier.columns), round(window_s * MICRO)):
         first_us = int(rows.t_us[0]) if first_us is None else first_us
-        window = examine_window(baseline, "window", (rows.t_us - first_us) / MICRO, rows.channels)
-        samples, windows, peak = samples + len(rows), windows + 1, max(peak, window.excess or 0.0)
+        if lacking := [name for name in names if name not in rows.channels]:
+            raise RecordingError(f"window: has no {', '.join(lacking)}, name columns as the loop file does")
+        signals = (rows.r, rows.u, rows.y, *(rows.channels[name] for name in names))
+        window = machine.judge_window("window", np.stack([(rows.t_us - first_us) / MICRO, *signals]))
+        samples, windows, peak = samples + len(rows), windows + 1, max(peak, window.evidence or 0.0)
         diagnosis, is_fault = window.diagnosis, window.diagnosis.verdict == "fault"
         if result and diagnosis.verdict == "undetermined":
-            continue  # an arm that rests takes nothing back
+            continue  # a machine that rests takes nothing back
         diagnosis = _on_clock_of_day(diagnosis, window.start, first_us / MICRO)
         document = json.loads(diagnosis.model_dump_json(exclude={"recording"}))
         result = {"diagnosis": document, "last_us": int(rows.t_us[-1])}
@@ -41,7 +46,7 @@ def examine_arm_day(baseline: ArmBaseline, files: Sequence[str], window_s: float
     if first_us is None:
         raise NotEnoughError("holds no rows")
     counts = {"samples": samples, "repeats": 0, "missing": 0, "gaps": 0, "evaluations": windows, "peak": peak}
-    return {"status": "examined", "error": None, "baseline": baseline.hash, "first_us": first_us, **counts, **result}
+    return {"status": "examined", "error": None, "baseline": machine.hash, "first_us": first_us, **counts, **result}
 
 
 def _on_clock_of_day(diagnosis: Diagnosis, start: float, first: float) -> Diagnosis:

@@ -1,4 +1,4 @@
-"""What stands for a monitor where an arm is followed: nothing is known of it between two examinations."""
+"""What stands for a monitor where a machine is judged window by window: nothing is known of it in between."""
 
 from __future__ import annotations
 
@@ -8,19 +8,15 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from servoscope.arm.baseline import ArmBaseline
 from servoscope.core.arrays import FloatArray
 from servoscope.detection.covariate_monitor import CovariateHistory
 from servoscope.diagnosis.monitor import Monitor
 
 
-class ArmMonitor:
-    """A monitor without state and evaluations; the torques of an arm need minutes to say something of its joints."""
+class IdleMonitor:
+    """A monitor without state and evaluations."""
 
     lane_key = None
-
-    def __init__(self, baseline: ArmBaseline) -> None:
-        self.baselines = (baseline,)
 
     def init(self) -> FloatArray:
         """Return the state, which is empty."""
@@ -44,4 +40,4 @@ class ArmMonitor:
         return {}
 
 
-AnyMonitor: TypeAlias = Monitor | ArmMonitor
+Follower: TypeAlias = Monitor | IdleMonitor

@@ -1,4 +1,4 @@
-"""An arm of the service: its last minutes are diagnosed one after the other, in a process of their own."""
+"""A machine that is judged window by window: its last minutes are diagnosed in a process of their own."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from servoscope.arm.baseline import ArmBaseline
-from servoscope.service.assets.arm_monitor import ArmMonitor
+from servoscope.machines.protocol import Machine
 from servoscope.service.assets.asset import Asset, AssetPolicy
 from servoscope.service.assets.block_lanes import Followed
 from servoscope.service.assets.examination import StoredDiagnosis
@@ -18,6 +17,7 @@ from servoscope.service.assets.examination_schedule import (
     schedule_full_diagnosis,
     update_examination,
 )
+from servoscope.service.assets.idle_monitor import IdleMonitor
 from servoscope.service.assets.records import NextBlock, StepResult, TableRow, diagnosis_row
 from servoscope.service.assets.residual_history import EvaluationStatus, LatestEvaluation, history_row
 from servoscope.service.clock import LayerTimes
@@ -27,19 +27,17 @@ from servoscope.signals import quality
 MIN_FILLED = 0.5  # of a window, before it is diagnosed after a pause
 
 
-class ArmAsset(Asset):
-    """Follows one arm.
+class WindowAsset(Asset):
+    """Follows one machine that has no follower.
 
     It is examined once per window, since nothing is known between two examinations, and each of them is a full
     diagnosis. Parameters are those of `Asset`.
     """
 
-    def __init__(
-        self, name: str, baseline: ArmBaseline, policy: AssetPolicy, group: str = "", source: str = ""
-    ) -> None:
+    def __init__(self, name: str, machine: Machine, policy: AssetPolicy, group: str = "", source: str = "") -> None:
         settings = policy.diagnosis
         settings = settings.model_copy(update={"every_s": min(settings.every_s, settings.window_s)})
-        super().__init__(name, baseline, ArmMonitor(baseline), replace(policy, diagnosis=settings), group, source)
+        super().__init__(name, machine, IdleMonitor(), replace(policy, diagnosis=settings), group, source)
 
     def follow(self, accepted: NextBlock, layers: LayerTimes) -> Followed:
         """Follow an accepted block: of its samples it counts which have all signals."""
