@@ -1,44 +1,16 @@
-"""Logs with known causes as features: simulated ones, and the measured process loops."""
+"""Measured logs of which something is known: process loops of which some stick, and servo channels that are healthy."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
-
-from assessment import loops
-from servoscope.assessment.assess import MIN_ROWS, equidistant
-from servoscope.assessment.causes import CAUSES
-from servoscope.assessment.features import analyse
 from servoscope.models.loop import Columns
 from servoscope.signals.readers.recording_file import read_rows
 from servoscope.signals.samples import Samples
 
 COLUMNS = Columns(time="time")
-EVERY = 12  # of the many short recordings of two folders, this one is taken
-
-
-@dataclass(frozen=True)
-class Records:
-    """Features of logs, and what is known of each."""
-
-    names: tuple[str, ...]
-    features: npt.NDArray[np.float64]  # (N, F)
-    possible: npt.NDArray[np.bool_]  # (N, causes)
-    loops: npt.NDArray[np.str_]  # which loop each is of, (N,)
-    sizes: npt.NDArray[np.float64]  # severity of simulated loops, (N,)
-
-
-def simulated(number: int, seed: int, family: str) -> Records:
-    """Return simulated loops of a family, each a loop of its own."""
-    made = loops.simulate(number, seed, family)
-    rows = [analyse(loop.r, loop.u, loop.y).features for loop in made]
-    possible = np.array([[cause == loop.cause for cause in CAUSES] for loop in made])
-    return _records(rows, possible, [f"{family} {i}" for i in range(number)], [loop.size for loop in made])
 
 
 def process_logs(folder: Path) -> Iterator[tuple[str, bool, Samples]]:
@@ -48,28 +20,6 @@ def process_logs(folder: Path) -> Iterator[tuple[str, bool, Samples]]:
     for row in rows:
         ((_, samples),) = read_rows(folder / row["file"], COLUMNS).items()
         yield row["loop"], row["label"] == "stiction", samples
-
-
-def measured(folder: Path) -> Records:
-    """Return the process loops; of one that does not stick, no more is known."""
-    logs = list(process_logs(folder))
-    rows = [analyse(s.r, s.u, s.y).features for _, _, s in logs]
-    possible = np.array([[(cause == "stiction") == sticks for cause in CAUSES] for _, sticks, _ in logs])
-    return _records(rows, possible, [loop for loop, _, _ in logs], [np.nan] * len(logs))
-
-
-def servos(folder: Path) -> Records:
-    """Return healthy servo recordings, of two large folders every twelfth: nothing is wrong but perhaps the grid."""
-    rows, names = [], []
-    for i, (of, name, log) in enumerate(servo_logs(folder)):
-        if of in ("sts3215", "ur10e") and i % EVERY:
-            continue
-        _, r, u, y, _ = equidistant(log, name)
-        if y.size >= MIN_ROWS:
-            rows.append(analyse(r, u, y).features)
-            names.append(of)
-    possible = np.array([[cause in ("good", "quantisation") for cause in CAUSES]] * len(rows))
-    return _records(rows, possible, names, [np.nan] * len(rows))
 
 
 def servo_logs(folder: Path) -> Iterator[tuple[str, str, Samples]]:
@@ -108,10 +58,3 @@ def _named(
 ) -> Iterator[tuple[str, str, Samples]]:
     for name, samples in read_rows(path, columns, where, by).items():
         yield folder, name, samples
-
-
-def _records(
-    rows: list[dict[str, float]], possible: npt.NDArray[np.bool_], names: list[str], sizes: list[float]
-) -> Records:
-    features = np.array([list(row.values()) for row in rows])
-    return Records(tuple(rows[0]), features, possible, np.array(names), np.array(sizes))

@@ -1,7 +1,6 @@
 """Textbook indices of one loop's log as plain functions, each with its equation, source and known failure.
 
-All take equidistant samples without gaps, shape (N,), and a period in samples. They are evidence for the posterior of
-`assess`, and are printed next to it in `benchmarks/assessment/score.py`.
+All take equidistant samples without gaps, shape (N,), and a period in samples.
 """
 
 from __future__ import annotations
@@ -62,11 +61,6 @@ def find_oscillation(x: FloatArray) -> Oscillation | None:
     intervals = np.diff(at)
     regularity = float(intervals.mean() / (3.0 * max(float(intervals.std()), 0.01 * float(intervals.mean()))))
     return Oscillation(2.0 * float(intervals.mean()), regularity, share, band)
-
-
-def octave_around(x: FloatArray, period: float) -> FloatArray:
-    """Return a signal within an octave around a period [samples]."""
-    return _octave(np.fft.rfft(signal.detrend(x)), np.fft.rfftfreq(x.size) * period, x.size)
 
 
 def _octave(spectrum: npt.NDArray[np.complex128], relative: npt.NDArray[np.floating[Any]], samples: int) -> FloatArray:
@@ -153,28 +147,3 @@ def ellipse_width(u: FloatArray, y: FloatArray, period: float) -> float:
     gain = 2.0 / np.hanning(u.size).sum()
     of_u, of_y = gain * (wave @ u), gain * (wave @ y)
     return float(2.0 * abs(of_u) * abs(np.sin(np.angle(of_u * np.conj(of_y)))))
-
-
-def harris_index(e: FloatArray, delay: int, order: int = 20) -> float:
-    """Return the variance under minimum variance control over the actual one, 0 to 1.
-
-    sigma^2_mv = (1 + psi_1^2 + ... + psi_(d-1)^2) sigma^2_a, psi: impulse response of an autoregression of the error
-    (Harris, Can. J. Chem. Eng. 67, 1989, 856-861). Known failure: it misleads as a verdict, since an oscillating loop
-    with a long delay may score well, and minimum variance is no goal; it is reported as a number only.
-    """
-    e = e - e.mean()
-    if not e.var() > 0.0 or e.size < 5 * order:
-        return float("nan")
-    rows = np.stack([e[order - i - 1 : -i - 1] for i in range(order)], axis=1)
-    a = np.linalg.lstsq(rows, e[order:], rcond=None)[0]
-    innovation = float(np.var(e[order:] - rows @ a))
-    impulse = signal.lfilter([1.0], np.r_[1.0, -a], np.r_[1.0, np.zeros(max(delay, 1) - 1)])
-    return min(innovation * float(np.square(impulse).sum()) / float(e.var()), 1.0)
-
-
-def harmonics(x: FloatArray, period: float) -> tuple[float, float]:
-    """Return the power at the second and third harmonic relative to the first, each in a band of half its width."""
-    power = np.abs(np.fft.rfft(x * np.hanning(x.size))) ** 2
-    frequency = np.fft.rfftfreq(x.size) * period
-    first, second, third = (power[np.abs(frequency - k) < 0.25].sum() for k in (1, 2, 3))
-    return float(second / max(first, 1e-300)), float(third / max(first, 1e-300))

@@ -53,19 +53,6 @@ def parse_time(text: str | None, option: str) -> float | None:
 MAX_SIMULATED_SAMPLES = 10_000_000  # of a simulation, which holds all of them at once
 
 
-def parse_range(text: str | None, option: str) -> tuple[float, float] | None:
-    """Read two numbers with a comma between, the lower one first; typer.BadParameter if they are not."""
-    if text is None:
-        return None
-    try:
-        low, high = (float(part) for part in text.split(","))
-    except ValueError:
-        low = high = math.nan
-    if not low < high:
-        raise typer.BadParameter(f"{option} {text!r}: write two numbers, the lower one first, as in 0,100")
-    return low, high
-
-
 def parse_healthy(texts: Sequence[str]) -> list[tuple[str, Path]]:
     """Read recordings to learn from: ``warm=c.csv`` is c.csv at the operating point warm, ``c.csv`` is at none.
 

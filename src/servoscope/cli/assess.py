@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -20,7 +20,7 @@ from servoscope.cli.output_paths import REPORTS, OutputPaths, check_output
 from servoscope.cli.progress import StepProgress, show_steps
 
 if TYPE_CHECKING:
-    from servoscope.assessment.assess import Assessment
+    from servoscope.assessment.assess import Assessment, Kind
     from servoscope.core.workers import Progress
     from servoscope.models.loop import Columns
     from servoscope.signals.samples import Samples
@@ -32,8 +32,9 @@ MIN_FILES_PER_START = 16  # for which it pays to start processes
 @with_reading_options("axis", "resample")
 def assess(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG", help="Logs, folders, or exports with many tags.")],
-    travel: Annotated[
-        str | None, typer.Option(metavar="LOW,HIGH", help="Range of u, for sizes in % of travel; 0,100 for example.")
+    kind: Annotated[
+        Literal["valve", "cylinder", "axis"] | None,
+        typer.Option(help="Kind of machine, for the advice; without it, by names of columns and sample rate."),
     ] = None,
     *,
     reading: ReadingOptions,
@@ -43,17 +44,15 @@ def assess(
         Path | None, typer.Option("--csv", metavar="FILE.csv", help="Write a work list, the worst loop first.")
     ] = None,
 ) -> None:
-    """Say from one log of a loop, without a baseline, what is most likely wrong; rank the loops of a folder."""
+    """Measure what one log of a loop shows, without a baseline; rank the loops of a folder."""
     logs = arguments.expand_files(logs)
     check_output(report, "--report", REPORTS, logs, folder=True)
     check_output(work_list, "--csv", (".csv",), logs)
-    limits = arguments.parse_range(travel, "--travel")
 
-    from servoscope.assessment import plant_loops
     from servoscope.assessment.assess import assess as assess_log
     from servoscope.cli.render import assessment, results
     from servoscope.core.files import atomic_write
-    from servoscope.report import assessment_page
+    from servoscope.report import assessment_page, loop_ranking
     from servoscope.report.plain_values import to_plain_values
 
     reader = arguments.RecordingReader.from_options(None, reading)
@@ -62,20 +61,20 @@ def assess(
     judged: list[Assessment] = []
     with show_steps(len(logs), 2) as steps:
         if pages is None and len(logs) >= MIN_FILES_PER_START:
-            for result in assess_files(logs, reader, limits, steps, failures):
+            for result in assess_files(logs, reader, kind, steps, failures):
                 judged.append(result)
             logs = []
         for path in logs:
             steps.begin(path.name)
             with failures.catch():
-                for name, samples in read_loops(path, reader):
+                for name, samples, seen in read_loops(path, reader):
                     steps.advance("assessing")
-                    result = assess_log(samples, name=name, travel=limits)
+                    result = assess_log(samples, name=name, kind=kind or seen)
                     judged.append(result)
                     if pages is not None:
                         with steps.pause():
                             pages.write(path, name, assessment_page.write_assessment_page, result, stderr=as_json)
-    ranked = plant_loops.rank(judged)
+    ranked = loop_ranking.rank(judged)
     if as_json:
         for result in ranked:
             print_json(to_plain_values(result), lines=len(ranked) > 1)
@@ -94,7 +93,7 @@ def assess(
 def assess_files(
     logs: Sequence[Path],
     reader: arguments.RecordingReader,
-    travel: tuple[float, float] | None,
+    kind: Kind | None,
     steps: StepProgress,
     failures: FailureCounter,
 ) -> Iterator[Assessment]:
@@ -102,7 +101,7 @@ def assess_files(
     from servoscope.assessment.assess import Assessment
     from servoscope.core.workers import WorkerError, Workers
 
-    tasks = ((path, reader, travel) for path in logs)
+    tasks = ((path, reader, kind) for path in logs)
     for (path, *_), results in Workers().map(f"{__name__}:assess_file", tasks, os.cpu_count() or 1):
         steps.begin(path.name)
         with failures.catch():
@@ -111,23 +110,21 @@ def assess_files(
             yield from map(Assessment.model_validate, results)
 
 
-def assess_file(
-    _: Progress, task: tuple[Path, arguments.RecordingReader, tuple[float, float] | None]
-) -> list[dict[str, Any]]:
+def assess_file(_: Progress, task: tuple[Path, arguments.RecordingReader, Kind | None]) -> list[dict[str, Any]]:
     """Assess the loops of one file, in a process of its own."""
     from servoscope.assessment.assess import assess as assess_log
 
-    path, reader, travel = task
+    path, reader, kind = task
     return [
-        assess_log(samples, name=name, travel=travel).model_dump(mode="json")
-        for name, samples in read_loops(path, reader)
+        assess_log(samples, name=name, kind=kind or seen).model_dump(mode="json")
+        for name, samples, seen in read_loops(path, reader)
     ]
 
 
-def read_loops(path: Path, reader: arguments.RecordingReader) -> Iterator[tuple[str, Samples]]:
-    """Yield the loops in a file with their names: by the mapping, or by the names of its columns."""
-    from servoscope.assessment.tags import find_loops
+def read_loops(path: Path, reader: arguments.RecordingReader) -> Iterator[tuple[str, Samples, Kind | None]]:
+    """Yield the loops in a file, by the mapping or by the names of its columns; tags are those of valves."""
     from servoscope.signals.readers.frames import open_source
+    from servoscope.signals.readers.tags import find_loops
 
     given = reader.columns
     loops = {"": given} if given is not None else find_loops(open_source(path, reader.text).columns)
@@ -135,7 +132,7 @@ def read_loops(path: Path, reader: arguments.RecordingReader) -> Iterator[tuple[
     first, last = reader.span
     for name, tag, samples in read_tags(path, loops, reader):
         rows = samples if reader.span == arguments.UNBOUNDED else samples[(samples.t >= first) & (samples.t < last)]
-        yield f"{name}[{tag}]" if len(loops) > 1 else name, rows
+        yield f"{name}[{tag}]" if len(loops) > 1 else name, rows, "valve" if tag else None
 
 
 def read_tags(

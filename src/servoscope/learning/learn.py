@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from servoscope.assessment.assess import assess
-from servoscope.assessment.causes import POOR_CONTROL
+from servoscope.assessment.assess import DOUBTS, assess
 from servoscope.baseline.axis_model import AxisModel, AxisMoves
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.records import BaselineSource, ExactPredictorFit, HealthyScatter, digest
@@ -48,11 +47,11 @@ Progress = Callable[[str], None]
 
 
 def doubt_healthy(recording: Recording) -> Message | None:
-    """Return that a recording shows a cause of poor control by itself, with near certainty, if it does."""
+    """Return what a recording shows by itself that forbids learning from it, if it does."""
     assessment = assess(recording)
-    if (cause := assessment.sure_cause) not in POOR_CONTROL:
+    if assessment.verdict not in DOUBTS:
         return None
-    return message("learning.doubt", recording=recording.name, cause=cause, probability=assessment.probability)
+    return message("learning.doubt", recording=recording.name, reason=assessment.reason)
 
 
 @with_one_blas_thread

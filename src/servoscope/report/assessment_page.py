@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from servoscope.assessment.assess import Assessment
 from servoscope.core.messages import say, translate
-from servoscope.report.format_values import DASH, format_duration, format_percent
+from servoscope.report.format_values import DASH, format_duration
 from servoscope.report.page import ResultTable, render_page, write_page
 
-KINDS = {"good": "healthy", "cannot tell": "undetermined"}  # classes of report.css
+KINDS = {"nothing conspicuous": "healthy", "cannot tell": "undetermined"}  # classes of report.css
 
 
 def write_assessment_page(path: str | Path, assessment: Assessment) -> None:
@@ -28,13 +28,11 @@ def render_assessment_page(assessment: Assessment) -> str:
 
     return render_page(
         "assessment.html",
-        title=f"{assessment.recording}: {assessment.verdict}",
+        title=f"{assessment.recording}: {translate(assessment.verdict)}",
         kind=KINDS.get(assessment.verdict, "fault"),
         assessment=assessment,
         size=assessment_size(assessment),
-        facts=list(facts(assessment)),
-        causes=cause_table(assessment),
-        indices=index_table(assessment),
+        facts=fact_table(assessment),
         figures=[(name, render_svg(figure, f"f{i}")) for i, (name, figure) in enumerate(plot_assessment(assessment))],
     )
 
@@ -45,44 +43,36 @@ def assessment_size(a: Assessment) -> str:
     return f"{format_duration(a.samples / a.sample_rate_hz)}, {samples}"
 
 
-def facts(a: Assessment) -> Iterator[tuple[str, str]]:
-    """Yield sizes with their names, those that the log gives."""
-    if a.stiction_percent is not None:
-        yield "apparent stiction", say("assess.of_travel", size=a.stiction_percent)
-    if a.backlash_percent is not None:
-        yield "apparent backlash", say("assess.of_travel", size=a.backlash_percent)
-    if a.period_s is not None and a.oscillates:
-        yield "period", format_duration(a.period_s)
-        yield "regularity", f"{a.regularity:.2g}"
-        yield "share of the error's variance", format_percent(a.oscillation_share)
-    if a.gain_margin is not None:
-        yield "gain margin as seen", f"{a.gain_margin:.2g}"
-    if a.performance is not None:
-        yield "Harris index", f"{a.performance:.2f}"
-
-
-def cause_table(a: Assessment) -> ResultTable:
-    """Return the probability of each cause, the likeliest first."""
-    ordered = sorted(a.probabilities.items(), key=lambda pair: -pair[1])
-    return ResultTable(("Cause", "Probability"), [(translate(cause), f"{p:.2f}") for cause, p in ordered if p >= 0.005])
-
-
-def index_table(a: Assessment) -> ResultTable:
-    """Return the textbook indices and the log-likelihoods of the competing models."""
-    return ResultTable(("Index", "Value"), [(translate(name), f"{value:.3f}") for name, value in a.indices.items()])
+def fact_table(a: Assessment) -> ResultTable:
+    """Return one row per fact: value, what it was computed from, and who defined it."""
+    rows = [
+        (
+            translate(fact.name),
+            f"{fact.value:.3g} {fact.unit}".strip(),
+            ", ".join(f"{translate(name)} {value:.3g}" for name, value in fact.evidence.items()) or DASH,
+            fact.source or DASH,
+        )
+        for fact in a.facts
+    ]
+    return ResultTable(("Fact", "Value", "Evidence", "Source"), rows, 3)
 
 
 def ranking_table(ranked: Sequence[Assessment]) -> ResultTable:
-    """Return one row per loop: verdict, probability, size, period and what to do."""
+    """Return one row per loop: verdict, period, and the facts that rank it."""
+
+    def percent(a: Assessment, *names: str) -> str:
+        worst = max(a.value(name, -1.0) for name in names)
+        return DASH if worst < 0.0 else f"{worst:.0f} %"
+
     rows = [
         (
             a.recording,
             a.verdict,
-            f"{a.probability:.2f}",
-            DASH if a.period_s is None or not a.oscillates else format_duration(a.period_s),
-            DASH if a.performance is None else f"{a.performance:.2f}",
-            str(a.reason),
+            format_duration(a.value("oscillation")) if a.value("oscillation") else DASH,
+            percent(a, "tracking error"),
+            percent(a, "u at its upper limit", "u at its lower limit"),
+            percent(a, "frozen y"),
         )
         for a in ranked
     ]
-    return ResultTable(("Log", "Verdict", "Probability", "Period", "Harris index", "Reason"), rows, 2)
+    return ResultTable(("Log", "Verdict", "Period", "Error", "At limit", "Frozen"), rows, 1)

@@ -9,23 +9,22 @@ from rich.padding import Padding
 from rich.text import Text
 
 from servoscope.assessment.assess import Assessment
-from servoscope.assessment.plant_loops import group_by_period
-from servoscope.cli.render.results import INDENT, print_facts, print_notes, print_result_table, print_title
+from servoscope.cli.render.results import INDENT, print_notes, print_result_table, print_title
 from servoscope.core.messages import say, translate
-from servoscope.report.assessment_page import assessment_size, facts, index_table, ranking_table
+from servoscope.report.assessment_page import assessment_size, fact_table, ranking_table
+from servoscope.report.loop_ranking import group_by_period
 from servoscope.report.page import ResultTable
 
 
 def print_assessment(out: Console, a: Assessment) -> None:
-    """Print verdict, probability, reason, the evidence and what to do."""
+    """Print the verdict and its reason, the facts, and what to do."""
     print_title(out, a.recording, f": {assessment_size(a)}")
-    colour = {"good": "green", "cannot tell": "yellow"}.get(a.verdict, "red")
+    colour = {"nothing conspicuous": "green", "cannot tell": "yellow"}.get(a.verdict, "red")
     head = translate(a.verdict)
-    words = f"{head[:1].upper()}{head[1:]} ({a.probability:.2f}): {a.reason}"
+    words = f"{head[:1].upper()}{head[1:]}: {a.reason}"
     out.print(Padding(Text(words, style=f"bold {colour}"), INDENT, expand=False))
-    print_facts(out, facts(a))
-    if a.indices:
-        print_result_table(out, index_table(a))
+    if a.facts:
+        print_result_table(out, fact_table(a).without("Source"))
     print_notes(out, [a.advice], "green", "-")
 
 
@@ -36,4 +35,4 @@ def print_ranking(out: Console, ranked: Sequence[Assessment]) -> None:
     print_result_table(out, ResultTable(table.head, rows, table.words))
     for group in group_by_period(ranked):
         names = [a.recording for a in group]
-        print_notes(out, [say("assess.group", names=names, period=group[0].period_s, source=names[0])])
+        print_notes(out, [say("assess.group", names=names, period=group[0].value("oscillation"), source=names[0])])

@@ -31,7 +31,7 @@ class AssetSnapshot:
     # what is wrong with a connection, with an asset that is left out, or with files that wait; None: none of them
     trouble: str | None = None
     outlook: str | None = None  # whether the limit of its fault is ``near`` or ``reached``; None: it has none
-    control: str | None = None  # what is nearly certainly wrong with the control; "": nothing; None: not assessed
+    control: str | None = None  # what the last minutes show by themselves; "": nothing; None: not assessed
     outlook_cause: str = ""  # the prognosis in a sentence
     alarms: tuple[str, ...] = ()  # the asset's alarms whose condition is abnormal; `advance_alarms` fills it in
     cause: str = ""  # what transitions name as their cause, for example the diagnosis in a sentence

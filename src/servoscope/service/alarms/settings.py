@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from servoscope.assessment.causes import CAUSES, POOR_CONTROL
+from servoscope.assessment.assess import DOUBTS
 from servoscope.core.messages import message, render
 from servoscope.core.settings import Finite, NonNegative, Positive, Settings
 from servoscope.core.settings_errors import describe_error
@@ -30,11 +30,11 @@ TROUBLE_SOURCES: tuple[AlarmSource, ...] = ("connection", "left_out", "backlog")
 SERVICE_SOURCES: tuple[AlarmSource, ...] = ("buffered", *TROUBLE_SOURCES)  # sources of the service itself
 SOURCE_WORDS: dict[str, tuple[str, ...]] = {
     "verdict": ("fault", "undetermined"), "quality": KINDS, "reception": STATES,
-    "outlook": ("near", "reached"), "control": CAUSES, **dict.fromkeys(TROUBLE_SOURCES, ("trouble",)),
+    "outlook": ("near", "reached"), "control": DOUBTS, **dict.fromkeys(TROUBLE_SOURCES, ("trouble",)),
 }  # fmt: skip
 ABNORMAL_WORDS: dict[str, tuple[str, ...]] = {  # where `when` says nothing
     "verdict": ("fault",), "quality": KINDS, "reception": ALARMED_STATES,
-    "outlook": ("near", "reached"), "control": POOR_CONTROL, **dict.fromkeys(TROUBLE_SOURCES, ("trouble",)),
+    "outlook": ("near", "reached"), "control": DOUBTS, **dict.fromkeys(TROUBLE_SOURCES, ("trouble",)),
 }  # fmt: skip
 
 
@@ -44,8 +44,8 @@ class AlarmDefinition(Settings):
     enabled: Annotated[bool, Field(strict=True)] = True  # whether there is this alarm at all
     # the ``verdict``, the findings of data ``quality``, how samples come in (``reception``), when a fault reaches its
     # limit (``outlook``, of assets that have a limit), the ``statistic`` T^2 or
-    # the sequential test's ``level`` as multiples of their limits, or the cause of poor ``control`` that the last
-    # minutes show without a baseline (`servoscope assess`); of the service itself the share of the buffer that
+    # the sequential test's ``level`` as multiples of their limits, or what the last minutes of ``control`` show
+    # without a baseline (`servoscope assess`); of the service itself the share of the buffer that
     # waits to be stored, ``buffered``, the ``connection`` of each source and outlet, each asset that is ``left_out``,
     # and the ``backlog`` of each source of files
     source: AlarmSource

@@ -39,7 +39,7 @@ class StoredDiagnosis(BaseModel):
     document: dict[str, Any] = {}  # of a diagnosis: as `diagnose --json` prints it
     # whether an alarm has gone that is still in the window: until it has left it, the window proves nothing
     recovering: bool = False
-    control: str | None = None  # the nearly certain cause of poor control, "" for none; None: not assessed
+    control: str | None = None  # what the samples show by themselves, "" for nothing; None: not assessed
     size: FaultEstimate | None = None  # of the fault that was named before, as it is now; None: not known
 
     @property
@@ -139,17 +139,16 @@ def examine_blocks(
 
 
 def _assess_blocks(baseline: Baseline, name: str, blocks: Sequence[Block]) -> str | None:
-    """Return the cause of poor control that the last minutes show with near certainty, "" if none.
-
-    None where the samples cannot be used, or do not suffice.
-    """
-    from servoscope.assessment.assess import assess
+    """Return what the last minutes show by themselves, "" if nothing; None where the samples do not suffice."""
+    from servoscope.assessment.assess import DOUBTS, assess
 
     try:
         assessment = assess(blocks_to_recording(baseline, name, blocks)[0])
     except ServoscopeError:
         return None
-    return assessment.sure_cause or (None if assessment.verdict == "cannot tell" else "")
+    if assessment.verdict == "cannot tell":
+        return None
+    return assessment.verdict if assessment.verdict in DOUBTS else ""
 
 
 def compile_examination(baseline: Baseline) -> None:

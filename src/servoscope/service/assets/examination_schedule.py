@@ -59,7 +59,7 @@ class ExaminationState:
     # size, sized: the newest size of the fault, by an examination, and when that was [UTC s]; {}: no such size yet
     size: dict[str, Any] = field(default_factory=dict)
     sized: float | None = None
-    control: str | None = None  # the cause of poor control, "" for none; None: not assessed
+    control: str | None = None  # what the samples show by themselves, "" for nothing; None: not assessed
 
     @classmethod
     def begin(cls, t: float, settings: DiagnosisSettings, phase: float, assets: int = 1) -> ExaminationState:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from servoscope.assessment.assess import assess
-from servoscope.assessment.tags import find_loops
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.comparison import compare_baselines
 from servoscope.core.errors import RecordingError
@@ -34,6 +33,7 @@ from servoscope.signals import Recording, readers
 from servoscope.signals.readers.axes import moving_axes, signals_of_one_axis
 from servoscope.signals.readers.formats import open_file
 from servoscope.signals.readers.guess_columns import guess_mapping
+from servoscope.signals.readers.tags import find_loops
 from servoscope.simulation.measurement import NOISE_U_STD, NOISE_Y_STD
 from servoscope.web.schemas import requests
 from servoscope.web.schemas.responses import JsonObject
@@ -96,7 +96,7 @@ def inspect_file(
 
 
 def assess_file(progress: Progress, file: str, request: requests.InspectionRequest) -> JsonObject:
-    """Return what is most likely wrong with a loop, from one log without a baseline; of several loops of the first."""
+    """Return what one log of a loop shows without a baseline; of several loops of the first."""
     loops = find_loops(open_file(file).columns)
     columns = _merge_columns(request.columns, None) if request.columns is not None else next(iter(loops.values()))
     ((name, samples),) = readers.read_rows(file, columns, request.where).items()

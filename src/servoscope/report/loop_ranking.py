@@ -1,0 +1,40 @@
+"""The assessed loops of a plant: the worst first, and those that oscillate together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from servoscope.assessment.assess import DOUBTS, Assessment
+
+PERIOD_TOLERANCE = 0.05  # relative difference of periods within a group
+
+
+def rank(assessments: Iterable[Assessment]) -> list[Assessment]:
+    """Return the worst loops first: what has a verdict, what oscillates, what tracks worst; the undecided come last."""
+
+    def badness(a: Assessment) -> tuple[float, ...]:
+        limits = max(a.value("u at its upper limit"), a.value("u at its lower limit"))
+        place = (*DOUBTS, "nothing conspicuous", "cannot tell").index(a.verdict)
+        return place, a.value("oscillation") == 0.0, -max(a.value("tracking error"), limits, a.value("frozen y"))
+
+    return sorted(assessments, key=badness)
+
+
+def group_by_period(assessments: Sequence[Assessment]) -> list[tuple[Assessment, ...]]:
+    """Return the loops that share a period, the likeliest source first; groups of two and more, the largest first.
+
+    The source is the loop that sticks or is at a limit, and of equals the one whose y rests longest while u moves on.
+    """
+    groups: list[list[Assessment]] = []
+    for a in sorted((a for a in assessments if a.value("oscillation")), key=lambda a: a.value("oscillation")):
+        period = a.value("oscillation")
+        if groups and period <= groups[-1][0].value("oscillation") * (1.0 + 2.0 * PERIOD_TOLERANCE):
+            groups[-1].append(a)
+        else:
+            groups.append([a])
+    ranked = [tuple(sorted(group, key=_source_rank, reverse=True)) for group in groups if len(group) > 1]
+    return sorted(ranked, key=len, reverse=True)
+
+
+def _source_rank(a: Assessment) -> tuple[bool, float]:
+    return a.verdict in DOUBTS, a.value("y rests while u moves on")
