@@ -147,6 +147,10 @@ def test_yule_walker_and_sample_autocovariance_are_the_textbook() -> None:
     assert model.a == pytest.approx(linalg.solve(linalg.toeplitz(gamma[:2]), gamma[1:]), rel=1e-6)
     assert model.a == pytest.approx(a, abs=0.02) and model.variance == pytest.approx(1.0, abs=0.03)
     assert coloured_is_autoregressive(model)
+    # a run shorter than the lags has no products at the others
+    assert sample_autocovariance([np.ones(2), np.ones(6)], 4) == pytest.approx(
+        np.array([8.0, 6.0, 4.0, 3.0, 2.0]) / 8.0
+    )
 
 
 def coloured_is_autoregressive(model: ArmaNoise) -> bool:

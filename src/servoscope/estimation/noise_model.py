@@ -100,7 +100,7 @@ class ArmaNoise:
 def sample_autocovariance(runs: Sequence[FloatArray], lags: int) -> FloatArray:
     """Return the autocovariance of a zero-mean signal at lags 0 ... lags, over several runs, shape (lags + 1,)."""
     total = sum(len(run) for run in runs)
-    products = [sum(float(run[lag:] @ run[: len(run) - lag]) for run in runs) for lag in range(lags + 1)]
+    products = [sum(float(run[lag:] @ run[: max(len(run) - lag, 0)]) for run in runs) for lag in range(lags + 1)]
     return np.array(products) / total
 
 
