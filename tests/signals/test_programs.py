@@ -59,6 +59,17 @@ def test_a_frame_with_several_rows_of_names(levels: int, index: str, tmp_path: P
     assert is_right(read(tmp_path / "frame.csv", columns=columns))
 
 
+@pytest.mark.parametrize("unit", ["ms", "[ms]", "(ms)"])
+def test_a_row_of_units_that_holds_that_of_the_time_alone(unit: str, tmp_path: Path) -> None:
+    """As TwinCAT Scope writes it where no channel has a unit."""
+    rows = (",".join(map(str, row)) for row in zip(1e3 * motion()["t"], *(motion()[c] for c in "ruy"), strict=True))
+    (tmp_path / "scope.csv").write_text("\n".join(["Time,SetPosition,ActTorque,ActPosition", f"{unit},,,", *rows]))
+    columns = propose_columns(tmp_path / "scope.csv", list_channels(tmp_path / "scope.csv"))
+    recording = read(tmp_path / "scope.csv", columns=columns)
+    np.testing.assert_allclose(recording.t, motion()["t"], atol=1e-6)
+    assert is_right(recording)
+
+
 @pytest.mark.parametrize("zone", ["Z", "+00:00", "+02:00", ""])
 @pytest.mark.parametrize("digits", [3, 6])
 def test_lines_of_json_with_iso_times(zone: str, digits: int, tmp_path: Path) -> None:

@@ -127,12 +127,14 @@ def _rows_above(rows: Sequence[Sequence[str]], first: int, width: int) -> list[l
             cells.pop()
         if not cells and not above:
             continue  # a blank line between header and rows
-        if not above and not index and width > 2 and len(cells) == width and [c for c in cells if c] == cells[:1]:
+        alone = not above and width > 2 and len(cells) == width and [c for c in cells if c] == cells[:1]
+        only_unit = alone and is_unit(cells[0].strip("[]() "))  # of the time: the others have none
+        if alone and not only_unit and not index:
             index = cells[0]
             continue
         lacking = width - len(cells)
         # a preamble has another width; a row of names may lack the last, where lines end in a delimiter
-        if not cells or lacking < 0 or lacking > 1 or sum(map(bool, cells)) < min(2, width):
+        if not cells or lacking < 0 or lacking > 1 or (sum(map(bool, cells)) < min(2, width) and not only_unit):
             break
         above.append([cells[0] or index, *cells[1:]] + [""] * lacking)
     return above
