@@ -69,7 +69,7 @@ def test_of_long_recordings_stretches_are_learned_and_the_whole_is_judged(
     day = record(loop, seconds=600.0)
     monkeypatch.setattr(operating_points, "MAX_SAMPLES", 20_000)
     learned = operating_points.learn(loop, day)
-    assert learned.sources[0].samples == 20_000
+    assert learned.sources[0].samples == day.samples == 60_000  # of the file, by which it is found again
     (note,) = [str(note) for note in learned.notes if "evenly spread" in str(note)]
     assert "learned from 20000 of 60000 rows" in note and "Healthy" in note
     worn = record(loop, seconds=600.0, faults=[FaultEvent("C_ie", 1.3, 300.0)])

@@ -18,7 +18,8 @@ import pytest
 from brokers import Sender, kafka_brokers, kafka_cluster, started_broker, until
 from brokers import block as mqtt_block
 from commands import one_line, run
-from test_opcua import NODES, RATE, STATUS, Plant, free_port
+from test_opcua import NODES, RATE, Plant, free_port
+from test_publishers import status
 
 from servoscope.models.loop import Loop
 from servoscope.service.kinds import PUBLISHERS, SOURCES, find_kinds
@@ -225,15 +226,20 @@ def test_a_source_keeps_its_contract(kind: str, check: str, request: pytest.Fixt
 @pytest.mark.parametrize("kind", sorted(find_kinds(PUBLISHERS)))
 def test_publishing_neither_raises_nor_blocks_and_closing_twice_is_no_error(kind: str, tmp_path: Path) -> None:
     port = free_port()
-    keys = {"mqtt": {"host": "127.0.0.1", "port": port, "every_s": 0.0}, "opcua": {"listen": f"127.0.0.1:{port}"}}[kind]
+    keys = {
+        "mqtt": {"host": "127.0.0.1", "port": port, "every_s": 0.0},
+        "opcua": {"listen": f"127.0.0.1:{port}"},
+        "aas": {"path": "shells", "every_s": 0.01},
+    }[kind]
     settings = find_kinds(PUBLISHERS)[kind].load().model_validate({"kind": kind, **keys})
     publisher = settings.create("hall.contract", tmp_path)
-    publisher.open({"press": STATUS, "hall": {"service": True}})  # nobody listens, no broker is there
+    press = {**status(), "counted": {"began": 0.0, "t": 1767225640.0}}
+    publisher.open({"press": press, "hall": {"service": True}})  # nobody listens, no broker is there
 
     def publish() -> None:
         begin = time.monotonic()
         for k in range(20):
-            publisher.publish({"press": {**STATUS, "statistic": float(k)}, "hall": {"service": True}})
+            publisher.publish({"press": {**press, "statistic": float(k)}, "hall": {"service": True}})
         assert time.monotonic() - begin < AT_ONCE_S
 
     publish()
