@@ -17,6 +17,7 @@ LOOP = ss.Loop.from_dict(
     {
         "name": "axis",
         "sample_rate": RATE,
+        "hold": "zoh",  # with "foh", which learn would take, the scan of the blind baseline stays below its limit
         "columns": {"covariates": {"oil": "oil"}},
         "plant": {"kind": "axis", "terms": ["viscous", "coulomb", "offset"]},
         "monitor": {"cutoff": 5.0, "memory": 4.0, "frequencies": [1.0]},

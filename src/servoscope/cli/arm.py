@@ -14,12 +14,12 @@ from servoscope.cli.output_paths import check_output
 from servoscope.core.errors import OutputError
 from servoscope.core.files import atomic_write
 from servoscope.core.messages import say
-from servoscope.machines.kinds import machine_class
 
 
 def write_proposal(logs: Sequence[Path], urdf: Path, output: Path, replace: bool) -> None:
     """Propose the loop file of an arm from a log and its URDF, write it, and print it."""
     from servoscope.cli.render import results
+    from servoscope.machines.kinds import machine_class
 
     if output.exists() and not replace:
         raise OutputError(f"{output}: exists; name another file with -o, or replace it with --yes")
@@ -44,6 +44,7 @@ def calibrate(
     check_output(output, "-o", (".toml",), [baseline, log])
 
     from servoscope.cli.render import results
+    from servoscope.machines.kinds import machine_class
 
     arm: Any = machine_class("arm")
     text, rows, open_joints = arm.load(baseline).calibrate(log, mass)

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
 from servoscope.cli.exit import FailureCounter, exit_after, print_json
 from servoscope.cli.output_paths import OutputPaths
 from servoscope.core.messages import say
-from servoscope.core.verdict import VerdictKind
-from servoscope.machines.kinds import machine_class
-from servoscope.machines.protocol import Machine
+
+if TYPE_CHECKING:
+    from servoscope.core.verdict import VerdictKind
+    from servoscope.machines.protocol import Machine
 
 
 def refuse_options(kind: str, options: Mapping[str, object]) -> None:
@@ -25,6 +27,7 @@ def refuse_options(kind: str, options: Mapping[str, object]) -> None:
 def learn_baseline(kind: str, loop: Path, logs: Sequence[Path], output: Path, as_json: bool) -> None:
     """Learn the baseline of a machine from healthy logs, write it, and print it."""
     from servoscope.cli.render import results
+    from servoscope.machines.kinds import machine_class
 
     failures = FailureCounter()
     machine = machine_class(kind).learn(loop, logs, failures.catch)
@@ -48,7 +51,8 @@ def diagnose_logs(
     from servoscope.report import document, plain_values
 
     pages = OutputPaths.from_option(report, ".html", len(logs) > 1, logs)
-    failures, verdicts = FailureCounter(), list[VerdictKind]()
+    failures = FailureCounter()
+    verdicts: list[VerdictKind] = []
     for path in logs:
         with failures.catch():
             judged = machine.judge(machine.read(path), lambda _: None)

@@ -24,7 +24,6 @@ from servoscope.cli.options import (
 from servoscope.cli.output_paths import REPORTS, TRACES, OutputPaths, check_output
 from servoscope.cli.progress import StepProgress, show_steps
 from servoscope.core.messages import say
-from servoscope.machines.kinds import LOOP, kind_of_file, kind_of_loop_file, load_machine
 
 if TYPE_CHECKING:
     from servoscope.baseline.baseline import Baseline
@@ -168,6 +167,7 @@ def learn(
     check_output(output, "-o", (), [loop, *files, *alike, *filter(None, [compare])])
 
     from servoscope.cli.render import results
+    from servoscope.machines.kinds import LOOP, kind_of_loop_file
     from servoscope.report import plain_values
 
     if (kind := kind_of_loop_file(loop)) != LOOP:
@@ -273,6 +273,7 @@ def diagnose(
     from servoscope.diagnosis.diagnose import diagnose as diagnose_recording
     from servoscope.diagnosis.diagnose import diagnose_with_trace
     from servoscope.diagnosis.verify import provenance
+    from servoscope.machines.kinds import LOOP, kind_of_file, load_machine
     from servoscope.report import document, plain_values
     from servoscope.signals.writers import write_table
 
