@@ -82,7 +82,10 @@ def test_a_repair_is_learned_by_a_running_service_and_one_step_leads_back(hall: 
     assert (note["who"], note["kind"], note["anew"]) == ("otto", "baseline", True) and "motor exchanged" in note["text"]
     renewed = ss.Baseline.load(settings.baseline_file("axis"))
     now = wait(lambda now: now.metadata.baseline == renewed.hash and now.verdict == "healthy")
-    assert now.learning is None and not now.alarms and not store.pending_commands()
+    assert now.learning is None and not store.pending_commands()
+    # its alarm goes on: the condition is gone, and nobody has acknowledged or reset it
+    now = wait(lambda now: not now.alarms["fault"].active)
+    assert now.alarms["fault"].state == "latched_unacknowledged"
     assert renewal.learning_progress(settings, store, "axis", now, renewed).can_go_back
     # a further healthy stretch joins the one that was kept with the history
     added = json.loads(run("relearn", hall, "axis", "--why", "run in", "--json").out)

@@ -103,7 +103,7 @@ def assess(log: Samples | Source, *, name: str | None = None, kind: Kind | None 
     Examples
     --------
     >>> [fact.name for fact in ss.assess("monday.csv").facts][:2]
-    ['quantum of y', 'tracking error']
+    ['oscillation', 'damping as seen']
     """
     if not isinstance(log, Samples):
         loops = find_loops(open_source(log).columns)

@@ -19,12 +19,30 @@ MIN_REST_SHARE = 0.1  # of the log, in one stretch
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """r, u and y on one clock; r is None where it is unknown."""
+    """Samples of a log, whose reference may be unknown."""
 
-    t: FloatArray
-    r: FloatArray | None
-    u: FloatArray
-    y: FloatArray
+    samples: Samples
+    known: bool  # whether r is
+
+    @property
+    def t(self) -> FloatArray:
+        """The time [s]."""
+        return self.samples.t
+
+    @property
+    def r(self) -> FloatArray | None:
+        """The reference; None where it is unknown."""
+        return self.samples.r if self.known else None
+
+    @property
+    def u(self) -> FloatArray:
+        """The control input."""
+        return self.samples.u
+
+    @property
+    def y(self) -> FloatArray:
+        """The measured output."""
+        return self.samples.y
 
     @property
     def step(self) -> float:
@@ -38,8 +56,7 @@ class Signals:
 
     def rows(self, chosen: BoolArray | slice) -> Signals:
         """Return some of the rows."""
-        r = None if self.r is None else self.r[chosen]
-        return Signals(self.t[chosen], r, self.u[chosen], self.y[chosen])
+        return Signals(self.samples[chosen], self.known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +78,7 @@ class LogForms:
             valid &= np.isfinite(samples.r)
         if valid.sum() < 2:
             raise RecordingError(f"{name}: u and y hold no numbers in the same rows, choose other columns")
-        recorded = Signals(samples.t, samples.r if known else None, samples.u, samples.y).rows(valid)
+        recorded = Signals(samples, known).rows(valid)
         steps = np.diff(recorded.t)
         if not (steps > 0.0).any():
             raise RecordingError(f"{name}: the time does not advance, choose another time column")
@@ -103,11 +120,8 @@ def form_even(log: Signals, runs: IntArray) -> Signals:
     part = log.rows(slice(edges[longest], edges[longest + 1]))
     even = np.arange(part.t[0], part.t[-1] + 0.5 * period, period)
     factor = -(-even.size // MAX_ROWS)
-    t, r, u, y = (
-        None if x is None else thin(np.interp(even, part.t, x), factor) for x in (part.t, part.r, part.u, part.y)
-    )
-    assert t is not None and u is not None and y is not None
-    return Signals(t, r, u, y)
+    t, r, u, y = (thin(np.interp(even, part.t, x), factor) for x in (part.t, part.samples.r, part.u, part.y))
+    return Signals(Samples.from_columns(t, r, u, y), log.known)
 
 
 def thin(x: FloatArray, factor: int) -> FloatArray:
