@@ -31,6 +31,8 @@ def write(context: Context, commit: int, **statistics: float) -> None:
         status |= {"alarms": {}, "statistic": statistic, "level": 0.0, "about": {"group": f"hall {number % 2}"}}
         if number % 50 == 3:
             status["alarms"] = {"limit": {"state": "unacknowledged", "since": 0.0, "priority": "high"}}
+        if number % 100 == 9:
+            status["learning"] = {"after": "repair", "since": 0.0, "learned_s": 10.0, "needed_s": 200.0}
         status |= {"counted": {"began": 0.0, "t": float(commit), "rows": 0}}
         batch.checkpoints[name] = {
             "asset": name, "sequence": commit, "state": b"", "status": status, "at": float(commit)

@@ -56,7 +56,7 @@ class _Columns(msgspec.Struct):
     level: float | None = None
     alarms: dict[str, _Alarm] = {}
     about: _About = msgspec.field(default_factory=_About)
-    learning: msgspec.Raw | None = None
+    learning: dict[str, object] | None = None
     service: bool = False
 
 
@@ -105,7 +105,7 @@ class FleetTable:
 
 
 def _is_plain(status: _Columns) -> bool:
-    return status.verdict == "healthy" and FAULT_ALARM not in status.alarms and status.learning in (None, b"null")
+    return status.verdict == "healthy" and FAULT_ALARM not in status.alarms and status.learning is None
 
 
 def severity(status: AssetStatus | _Columns) -> float:
