@@ -16,6 +16,7 @@ import numpy as np
 
 from servoscope.core.errors import StoreError
 from servoscope.diagnosis.monitor import Monitor
+from servoscope.machines.servo_loop import LoopMachine
 from servoscope.service import build, log
 from servoscope.service import service as service_module
 from servoscope.service.actions import delivery
@@ -141,20 +142,20 @@ class Ground:
         return halls.baseline().to_text().encode()
 
     def monitor(self, baseline: Any) -> Monitor:
-        """Return the monitor of a baseline that `load_baseline` has returned."""
+        """Return the monitor of a baseline, which is made once."""
         if id(baseline) not in self._monitors:
             self._monitors[id(baseline)] = Monitor(baseline)
         return self._monitors[id(baseline)]
 
-    def load_baseline(self, path: Path) -> Any:
-        """Return the baseline in a file, which is parsed once."""
+    def load_machine(self, path: Path) -> Any:
+        """Return the machine of a file, which is parsed once."""
         content = path.read_bytes()
         if content not in self._files:
             self._files[content] = REAL_LOAD(path)
         return self._files[content]
 
 
-REAL_LOAD, REAL_SEAL = build.load_baseline, StoreWriter._seal
+REAL_LOAD, REAL_SEAL = build.load_machine, StoreWriter._seal
 
 
 @functools.cache
@@ -350,8 +351,8 @@ class World:
         yield delivery, "send_mail", self.receivers.mail
         yield StoreWriter, "_seal", lambda writer: self._seal(writer)
         # what is the same for all histories is read and compiled once
-        yield build, "load_baseline", self.ground.load_baseline
-        yield build, "Monitor", self.ground.monitor
+        yield build, "load_machine", self.ground.load_machine
+        yield LoopMachine, "follower", lambda machine: self.ground.monitor(machine.baseline)
         yield build, "compile_examination", lambda _: None
         yield ServiceFile, "load_again", lambda config, _: config
         yield log.LOGGER, "disabled", True
