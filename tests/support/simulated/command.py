@@ -17,6 +17,7 @@ from simulated.planted import PLANTED
 from simulated.world import Found, World
 
 RARE = 10  # pairs of fault and place that are printed as the rarest
+LONGEST_HISTORY_S = 60.0
 MOST_BROKEN = 5  # after which no further seed is tried
 MOST_SEEDS = 2000  # within which a planted fault has to be found
 
@@ -67,7 +68,8 @@ def run_minutes(first: int, steps: int, minutes: float) -> int:
     jobs = os.cpu_count() or 1
     deadline = time.monotonic() + 60.0 * minutes
     with multiprocessing.get_context("spawn").Pool(jobs) as pool:
-        parts = pool.map(_work, [(first + i, jobs, steps, deadline) for i in range(jobs)])
+        work = pool.map_async(_work, [(first + i, jobs, steps, deadline) for i in range(jobs)])
+        parts = work.get(60.0 * minutes + LONGEST_HISTORY_S)  # a history that waits for ever is an error, too
     histories, ended = (sum(part[i] for part in parts) for i in range(2))
     reached = sum((part[2] for part in parts), Counter[tuple[str, str]]())
     counts = sum((part[3] for part in parts), Counter[str]())
