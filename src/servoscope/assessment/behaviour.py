@@ -10,11 +10,9 @@ from numpy.polynomial import polynomial
 
 from servoscope.assessment import indices
 from servoscope.assessment.facts import LoopFact, find_quantum, noise_of
-from servoscope.assessment.indices import Oscillation
 from servoscope.assessment.log import LogForms, Signals, thin
 from servoscope.core.arrays import FloatArray
 
-MIN_REGULARITY = 1.0  # of an oscillation, after Thornhill et al.
 MIN_SAMPLES_PER_PERIOD = 6.0
 WINDOWS, WINDOWS_PER_PERIOD = 100, 12  # of a log, and of an oscillation, in which y is looked at for rest
 MAX_REST, NOISE_BAND, MIN_ERROR = 0.2, 4.0, 6.0  # of the error; of the noise of a window; of the same
@@ -29,15 +27,9 @@ MIN_SPEED = 0.05  # of the largest speed
 MIN_BAND = 3.0  # of a dead band, in standard errors and in quanta
 
 
-def find_cycle(log: Signals) -> Oscillation | None:
-    """Return the oscillation of the error where it is regular."""
-    cycle = indices.find_oscillation(log.e)
-    return cycle if cycle is not None and cycle.regularity > MIN_REGULARITY else None
-
-
 def oscillation(log: LogForms) -> Iterable[LoopFact]:
     """Yield the regular oscillation of the error, and whether it is sampled often enough."""
-    cycle, step = find_cycle(log.even), log.even.step
+    cycle, step = log.even.cycle, log.even.step
     if cycle is None:
         return
     shares = {"regularity": min(cycle.regularity, 100.0), "share of the error's variance [%]": 100.0 * cycle.share}
@@ -128,7 +120,7 @@ def rest_while_driven(log: Signals) -> tuple[float, list[tuple[int, int]]]:
     integrator winds up against a valve that sticks (Yamashita, Control Eng. Practice 14, 2006, 503-510); in a linear
     loop, however slow, a stretch ends after a fifth of the way that u has to go.
     """
-    e, cycle = log.e, find_cycle(log)
+    e, cycle = log.e, log.cycle
     width = max(e.size // WINDOWS, 1)
     if cycle is not None:
         width = int(np.clip(cycle.period / WINDOWS_PER_PERIOD, 1, width))
@@ -167,7 +159,7 @@ def valve_signs(log: LogForms) -> Iterable[LoopFact]:
             spans=tuple((float(x.t[a]), float(x.t[b])) for a, b in where[:100]),
             source="Yamashita, Control Eng. Practice 14, 2006, 503",
         )
-    cycle = find_cycle(x)
+    cycle = x.cycle
     if cycle is None or cycle.period < MIN_SAMPLES_PER_PERIOD or not np.ptp(x.u) > 0.0:
         return
     u, y = (indices.smooth_to(s, cycle.period) for s in (x.u, x.e))

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict
 
 from servoscope.assessment.log import LogForms, Signals
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
+from servoscope.signals.defects import mask_edges
 
 ROUNDING = 1e-9  # of the range of a signal, below which two numbers are the same
 MAX_GRID_ROWS = 100_000  # that a grid is looked for in
@@ -54,8 +55,8 @@ class LoopFact(BaseModel):
 
 def constant_runs(mask: BoolArray) -> tuple[IntArray, IntArray]:
     """Return where runs of true values begin, and their lengths."""
-    edges = np.flatnonzero(np.diff(np.r_[False, mask, False].astype(np.int8)))
-    return edges[::2], edges[1::2] - edges[::2]
+    starts, stops = mask_edges(mask).T
+    return starts, stops - starts
 
 
 def repeats(x: FloatArray) -> BoolArray:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from servoscope.assessment.indices import Oscillation, find_oscillation
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.errors import RecordingError
 from servoscope.signals.samples import Samples
@@ -14,6 +16,7 @@ MAX_FILLED_GAP = 3  # samples that are interpolated; at a longer gap the log is 
 MAX_ROWS = 200_000  # of the even stretch; of a longer one, means of neighbours
 REST_BLOCKS = 200  # of a log, in which rest is looked for
 MAX_REST_RANGE = 0.02  # of the range of a signal in the log
+MIN_REGULARITY = 1.0  # of an oscillation, after Thornhill et al.
 MIN_REST_SHARE = 0.1  # of the log, in one stretch
 
 
@@ -53,6 +56,12 @@ class Signals:
     def e(self) -> FloatArray:
         """The control error; of an unknown reference, the mean of y is taken."""
         return (self.r if self.r is not None else float(self.y.mean())) - self.y
+
+    @cached_property
+    def cycle(self) -> Oscillation | None:
+        """The oscillation of the error where it is regular."""
+        strongest = find_oscillation(self.e)
+        return strongest if strongest is not None and strongest.regularity > MIN_REGULARITY else None
 
     def rows(self, chosen: BoolArray | slice) -> Signals:
         """Return some of the rows."""

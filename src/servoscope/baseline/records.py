@@ -88,7 +88,9 @@ class BaselineSource(BaselineModel):
 
     def fits(self, recording: Recording) -> bool:
         """Tell whether this is the recording, not another of its name."""
-        return self.samples == recording.samples and self.hash in ("", hash_arrays(recording.u, recording.y))
+        if self.samples != recording.samples:
+            return False
+        return not self.hash or self.hash == hash_arrays(recording.u, recording.y)
 
 
 Occasion = Literal["repair", "tool", "product", "season"]

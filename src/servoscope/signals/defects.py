@@ -29,10 +29,14 @@ class Defect:
         return render(self.text)
 
 
+def mask_edges(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
+    """Return first index and index after the last of each stretch in which the mask, shape (N,), is true: (M, 2)."""
+    return np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8))).reshape(-1, 2)
+
+
 def mask_spans(mask: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return first index and index after the last of each stretch in which the mask, shape (N,), is true."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
+    """Return the same as pairs of numbers."""
+    return [(int(start), int(stop)) for start, stop in mask_edges(mask)]
 
 
 def split_consecutive(rows: npt.NDArray[np.intp]) -> list[npt.NDArray[np.intp]]:

@@ -49,7 +49,7 @@ from servoscope.service.assets.records import (
     transition_row,
 )
 from servoscope.service.assets.states import AssetStates, StateHolder
-from servoscope.service.assets.status import Announcement, asset_metadata, asset_status
+from servoscope.service.assets.status import Announcement, asset_metadata, asset_status, checks_of_named
 from servoscope.service.clock import LayerTimes
 from servoscope.service.config import DiagnosisSettings
 from servoscope.service.sources.block import Block
@@ -177,8 +177,8 @@ class Asset(StateHolder):
 
     def status(self, state: AssetState) -> dict[str, Any]:
         """Return what users see of a state, as stored."""
-        about = self.alarms.definitions, self._metadata, self.reception, self.alarms.announced
-        return asset_status(state, *about, self.policy.diagnosis.kept_s)
+        about = self._metadata | checks_of_named(self.machine, state.examination.faults), self.reception
+        return asset_status(state, self.alarms.definitions, *about, self.alarms.announced, self.policy.diagnosis.kept_s)
 
     @property
     def first_needed_sequence(self) -> int:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from servoscope.core.arrays import FloatArray
 from servoscope.detection.covariate_monitor import CovariateHistory
@@ -22,16 +20,7 @@ class IdleMonitor:
         """Return the state, which is empty."""
         return np.zeros(0)
 
-    def run_lanes(
-        self,
-        states: FloatArray,
-        r: npt.ArrayLike,
-        u: npt.ArrayLike,
-        y: npt.ArrayLike,
-        restart: npt.ArrayLike | None = None,
-        *,
-        channels: Mapping[str, npt.ArrayLike] | None = None,
-    ) -> tuple[FloatArray, None]:
+    def run_lanes(self, states: FloatArray, *signals: object, **channels: object) -> tuple[FloatArray, None]:
         """Return the states and no evaluations."""
         return states, None
 

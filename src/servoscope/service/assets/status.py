@@ -163,10 +163,17 @@ def asset_metadata(machine: Machine, group: str, window_s: float, source: str = 
         sample_rate_hz=machine.rate,
         coefficient_units=machine.coefficient_units,
         faults=dict(machine.fault_words),
-        checks={name: tuple(map(render, machine.checks(name))) for name in machine.fault_words},
         window_s=window_s,
         **signals,
     ).model_dump(mode="json", exclude_unset=True)
+
+
+def checks_of_named(machine: Machine, faults: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the metadata that change: what to check for the faults that are named now, where there are some."""
+    names = [fault["name"] for fault in faults]
+    known = machine.fault_words if names else {}
+    checks = {name: [render(check) for check in machine.checks(name)] if name in known else [] for name in names}
+    return {"checks": checks} if checks else {}
 
 
 def asset_summary(examination: ExaminationState, findings: Iterable[str], reception: Reception = RECEPTION_OK) -> str:
@@ -224,8 +231,7 @@ def asset_status(
 ) -> dict[str, Any]:
     """Return the status of an asset as stored, an `AssetStatus`, whose values are checked where it is read.
 
-    `metadata`: as `asset_metadata` returns it; `announced`: after which it learns again; `kept_s`: how long samples
-    are kept.
+    `metadata`: as stored; `announced`: after which it learns again; `kept_s`: how long samples are kept.
     """
     examination, findings = state.examination, quality.active_findings(state.quality)
     now = quality.limit_verdict(examination.verdict, findings)
@@ -236,8 +242,6 @@ def asset_status(
     if verdict == "fault" and now != "fault":
         fault = named or render(message("service.examination.seen"))
         summary = render(message("service.examination.stands", fault=fault, t=examination.fault_at, since=summary))
-    known_checks = metadata.get("checks", {})
-    checks = {fault["name"]: known_checks.get(fault["name"], ()) for fault in examination.faults}
     learning = None
     if announced is not None:
         needed_s = min(MIN_LEARN_S, kept_s)
@@ -277,6 +281,5 @@ def asset_status(
         **({} if examination.diagnosed is None else {"diagnosed": examination.diagnosed}),
         **({} if outlook is None else {"outlook": outlook.model_dump(mode="json", exclude_unset=True)}),
         "counted": vars(state.position),
-        "about": {key: value for key, value in metadata.items() if key != "checks"}
-        | ({"checks": checks} if checks else {}),
+        "about": metadata,
     }
