@@ -29,6 +29,8 @@ from servoscope.simulation import reference, simulate
 
 HONEST = [name for name in ALL if not {"covariance", "mean"} & set(estimators.exceptions(name))]
 
+REST = 10_000  # samples at rest that one call takes: a call for each would take minutes
+
 
 def filterpy_of(run: Run) -> KalmanFilter:
     """Return filterpy's Kalman filter of the random walk (5), (6), at the state of a run."""
@@ -153,17 +155,18 @@ class TestSlidingWindow:
 class TestWindup:
     def test_at_rest(self) -> None:
         """AKF and DFRLS stand still, KF grows linearly, RLS e-fold every memory until it refuses to go on."""
-        zero, runs = np.zeros((1, n)), {name: Run(name) for name in ("akf", "dfrls", "rls-reset", "kf", "rls")}
+        rest = np.full(REST, 3.0), np.zeros((REST, n)), np.zeros((REST, n))
+        runs = {name: Run(name) for name in ("akf", "dfrls", "rls-reset", "kf", "rls")}
         P, P_d, theta = runs["akf"].P.copy(), runs["akf"].P_d, runs["akf"].theta.copy()
         for run in runs.values():
-            run.steps(np.array([3.0]), zero, zero, 100_000)
+            run.steps(*rest, 100_000)
         for name in ("akf", "dfrls", "rls-reset"):
             assert np.array_equal(runs[name].P, P)
         assert pytest.approx(P + 200.0 * P_d, rel=1e-8) == runs["kf"].P
         factor = runs["rls"].P / P
         assert np.log(factor) == pytest.approx(-100_000 * np.log(1.0 - 1.0 / MEMORY), rel=1e-9)  # e^200.2
         for name, refused in (("kf", 0), ("rls", 646_000)):
-            skipped = runs[name].steps(np.array([3.0]), zero, zero, 900_000)
+            skipped = runs[name].steps(*rest, 900_000)
             assert skipped == pytest.approx(refused, rel=2e-3)
         assert pytest.approx(P + 2000.0 * P_d, rel=1e-7) == runs["kf"].P
         assert 1e307 < np.abs(runs["rls"].P).max() < np.inf
@@ -171,11 +174,11 @@ class TestWindup:
 
     def test_what_the_next_sample_does_after_a_rest(self) -> None:
         """phi' K, how far theta_hat runs after one noisy sample, after 20 memories of rest."""
-        phi, zero, eager = np.array([1.0, 0.5, -1.0, 0.2]), np.zeros((1, n)), {}
+        phi, eager = np.array([1.0, 0.5, -1.0, 0.2]), {}
         P_d = R / MEMORY * np.eye(n)
         for name in ("akf", "dfrls", "rls-reset", "kf", "rls"):
             run = Run(name, P_d, P_d)
-            run.steps(np.array([3.0]), zero, zero, 10_000)
+            run.steps(np.full(REST, 3.0), np.zeros((REST, n)), np.zeros((REST, n)))
             run.step(1.0, phi)
             eager[name] = float(phi @ run.K)
         at_P_d = float(phi @ phi / (MEMORY + phi @ phi))
@@ -185,8 +188,8 @@ class TestWindup:
         assert eager["rls"] > 0.999999
 
     def test_rls_stays_finite_when_motion_comes_back_after_it_has_overflowed(self) -> None:
-        run, zero = Run("rls"), np.zeros((1, n))
-        run.steps(np.array([3.0]), zero, zero, 1_000_000)
+        run = Run("rls")
+        run.steps(np.full(REST, 3.0), np.zeros((REST, n)), np.zeros((REST, n)), 1_000_000)
         run.steps(*samples(1000))
         assert np.all(np.isfinite(run.theta)) and np.all(np.isfinite(run.P))
 

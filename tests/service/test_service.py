@@ -73,13 +73,13 @@ def test_an_uninterrupted_run_says_what_is_there(whole: dict[str, list[object]],
 
 
 @pytest.mark.slow
-def test_killed_at_any_of_200_moments_every_block_counts_once(
+def test_killed_at_any_of_20_moments_every_block_counts_once(
     folder: Path, whole: dict[str, list[object]], carrier: Carrier
 ) -> None:
     cut, chance = hall(folder, "cut", speed=15.0), random.Random(7)
-    for _ in range(200):
+    for _ in range(20):
         process = carrier.start(cut)
-        time.sleep(chance.uniform(0.0, 0.12))
+        time.sleep(chance.uniform(0.0, 0.5))
         carrier.kill(process)
     killed_at = dict(asked(cut, "SELECT asset, sequence FROM checkpoints"))["press"]
     assert killed_at > 20  # of 360: the kills were spread over the run

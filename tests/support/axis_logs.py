@@ -53,7 +53,7 @@ def repaired_axis(folder: Path) -> Path:
     config.write_text(
         'name = "hall"\n[service]\nlisten = ""\nlog = "error"\n[store]\nurl = "history.sqlite"\n'
         "[diagnosis]\nwindow_s = 60.0\nkeep_s = 200.0\nevery_s = 60.0\n"
-        '[sources.line]\nkind = "replay"\nspeed = 20.0\n'
+        '[sources.line]\nkind = "replay"\nspeed = 50.0\n'
         '[assets.axis]\nbaseline = "axis.json"\nsource = "line"\nfiles = ["after.csv"]\n'
     )
     return config

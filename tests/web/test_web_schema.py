@@ -30,7 +30,7 @@ def test_no_request_makes_the_server_fail(tmp_path: Path) -> None:
     config = ServiceFile.load(halls.hall(tmp_path, "done", more=WEB))
     Service(config, build_components(config)).run()
     with Served(tmp_path, "serve", "done.toml") as served:
-        command = ["--checks", CHECKS, "--max-examples", str(SECONDS or 10), "--seed", "1"]
+        command = ["--checks", CHECKS, "--max-examples", str(SECONDS or 4), "--seed", "1"]
         command += ["--max-time", str(SECONDS)] if SECONDS else []
         command += ["--phases", "coverage,fuzzing,stateful", "--generation-database", "none", "--request-timeout", "60"]
         command += ["--exclude-path", "/api/v1/live", "--no-color", "--continue-on-failure"]
