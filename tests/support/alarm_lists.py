@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,14 @@ class NodeAlarmList:
         """Acknowledge an alarm of its list; return the name of the status."""
         return str(self.ask("acknowledge", condition=row["condition"], eventId=row["eventId"], comment=comment))
 
+    def pause(self) -> None:
+        """Let it do nothing, as on a machine that is busy."""
+        self._process.send_signal(signal.SIGSTOP)
+
+    def go_on(self) -> None:
+        """End the pause."""
+        self._process.send_signal(signal.SIGCONT)
+
     def close(self) -> None:
         """End it."""
         self._process.kill()
@@ -54,7 +62,11 @@ class PythonAlarmList:
         from asyncua.sync import Client
 
         self._ua, self._client, self._rows = ua, Client(url, timeout=30.0), dict[str, Row]()
-        self._client.connect()
+        try:
+            self._client.connect()
+        except OSError:
+            self._client.tloop.stop()  # its thread, which would go on
+            raise
         subscription = self._client.create_subscription(100, self)
         subscription.subscribe_events(ua.ObjectIds.Server, ua.ObjectIds.AlarmConditionType)
         number = ua.Variant(subscription.aio_obj.subscription_id, ua.VariantType.UInt32)
@@ -97,6 +109,3 @@ class PythonAlarmList:
     def close(self) -> None:
         """End it."""
         self._client.disconnect()
-
-
-ALARM_LISTS: tuple[Callable[[str], NodeAlarmList | PythonAlarmList], ...] = (NodeAlarmList, PythonAlarmList)

@@ -16,6 +16,7 @@ from servoscope.core.errors import SourceError
 from servoscope.service.log import log
 from servoscope.service.opcua import device_health
 from servoscope.service.opcua.conditions import AlarmConditions
+from servoscope.service.opcua.reconnection import follow_standard
 from servoscope.service.opcua.settings import CertificateSettings, check_files, import_asyncua, import_ua
 from servoscope.service.publishers.base import AlarmCommand, PublisherSettings, StatusByAsset
 
@@ -70,6 +71,7 @@ class OpcuaServer:
     def __init__(self, settings: OpcuaServerSettings, folder: Path, name: str = "opcua") -> None:
         import_asyncua()
         self.settings, self._folder, self._name = settings, folder, name
+        self.address = settings.listen  # once open with the port that the system gave in the place of 0
         check_files(folder, settings.cert_file, settings.key_file)
         self._nodes: dict[str, dict[str, Any]] = {}
         self._assets: dict[str, Any] = {}
@@ -103,12 +105,16 @@ class OpcuaServer:
             log("error", "OPC UA server stopped", why=self._trouble)
         finally:
             self._started.set()
+            for task in (left := asyncio.all_tasks(self._loop)):  # sessions of the library, which wait for their end
+                task.cancel()
+            self._loop.run_until_complete(asyncio.gather(*left, return_exceptions=True))
             self._loop.close()
 
     async def _run(self) -> None:
         ua = import_ua()
         server: Any = import_asyncua().Server()
         server.iserver.bind_condition_methods = REFRESH_SEVERITY
+        follow_standard(server.iserver)
         await server.init()
         server.iserver.max_connections, server.iserver.max_pending_activation_seconds = MAX_CONNECTIONS, HANDSHAKE_S
         server.set_endpoint(f"opc.tcp://{self.settings.listen}/servoscope")
@@ -128,6 +134,7 @@ class OpcuaServer:
         await self._conditions.link()
         await self._write_values()
         async with server:
+            self.address = f"{server.bserver.hostname}:{server.bserver.port}"
             self._started.set()
             await self._stop_event.wait()
 
