@@ -71,8 +71,9 @@ pictures: $(STAMP)  ## the pictures of README and docs, with the record of what 
 docs: $(STAMP)     ## the site of docs/, as wheels have it: servoscope docs opens it
 	$(BIN)/python -m sphinx -q -W -E -d build/docs docs src/servoscope/site
 
-sbom: $(STAMP)     ## the software bill of materials of a release, as CycloneDX: servoscope.cdx.json
+sbom: $(STAMP)     ## of a release: the bill of materials (CycloneDX), and what advisories mean for it (OpenVEX)
 	$(BIN)/python scripts/sbom.py -o servoscope.cdx.json
+	$(BIN)/python scripts/audit.py --vex servoscope.openvex.json
 
 clean:          ## remove what the other targets made
 	rm -rf $(VENV) demo-output .cache .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist src/servoscope/site

@@ -20,7 +20,7 @@ PAGE = Path(__file__).resolve().parent.parent / "docs" / "reference" / "api.md"
 SECTIONS = ("Parameters", "Returns", "Raises", "Examples")
 ORDER = (
     "init", "read", "read_parts", "Recording", "Loop", "inspect", "learn", "relearn", "Baseline", "diagnose",
-    "Diagnosis", "Monitor", "Trace", "plot", "write_report", "NoveltyDetector", "simulate", "design_study",
+    "Diagnosis", "Monitor", "Trace", "plot", "write_report", "NoveltyDetector", "simulate", "design_study", "reproduce",
 )  # fmt: skip
 INTRODUCTION = """# Python, in detail
 

@@ -3,6 +3,7 @@
 
     scripts/audit.py                    prints what has a known hole, and exits with 1 then
     scripts/audit.py --renew all.zip    takes the advisories of locked packages from OSV's export of its PyPI records
+    scripts/audit.py --vex FILE         writes what each advisory means for servoscope, as OpenVEX 0.2.0
 
 `scripts/advisories.json` has records in OSV's form, and the day on which they were taken.
 """
@@ -11,9 +12,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -27,9 +29,9 @@ LOCK_FILES = ("requirements.lock", "requirements-dev.lock")
 KEPT = ("id", "modified", "aliases", "summary", "affected")
 
 
-def locked_versions(root: Path) -> dict[str, Version]:
-    """Return the version of each package in the lock files, which agree in those that both have."""
-    lines = [line for name in LOCK_FILES for line in (root / name).read_text(encoding="utf-8").splitlines()]
+def locked_versions(root: Path, files: Sequence[str] = LOCK_FILES) -> dict[str, Version]:
+    """Return the version of each package in lock files, which agree in those that both have."""
+    lines = [line for name in files for line in (root / name).read_text(encoding="utf-8").splitlines()]
     pinned = (line.split()[0].split("==") for line in lines if "==" in line and line[0].isalnum())
     return {canonicalize_name(name): Version(version) for name, version in pinned}
 
@@ -89,10 +91,42 @@ def take_records(export: Path, versions: dict[str, Version]) -> dict[str, Any]:
     return {"taken": today, "source": "OSV, all records of PyPI", "vulns": records}
 
 
+def state_exposure(advisories: dict[str, Any], root: Path) -> dict[str, Any]:
+    """Return an OpenVEX document: for each advisory on a package that a release installs, whether it applies."""
+    versions = locked_versions(root, LOCK_FILES[:1])
+    source = (root / "src" / "servoscope" / "__init__.py").read_text(encoding="utf-8")
+    release = re.findall(r'^__version__ = "(.+)"', source, re.MULTILINE)[0]
+    statements = []
+    for record in advisories["vulns"]:
+        for affected in record["affected"]:
+            name = canonicalize_name(affected["package"]["name"])
+            if name not in versions:
+                continue
+            part = {"@id": f"pkg:pypi/{name}@{versions[name]}"}
+            statement: dict[str, Any] = {
+                "vulnerability": {"name": record["id"], "aliases": record.get("aliases", [])},
+                "products": [{"@id": f"pkg:pypi/servoscope@{release}", "subcomponents": [part]}],
+            }
+            if is_affected(versions[name], affected):
+                statement |= {"status": "affected", "action_statement": f"Install another version of {name}."}
+            else:
+                statement |= {"status": "not_affected", "justification": "vulnerable_code_not_present"}
+            statements.append(statement)
+    return {
+        "@context": "https://openvex.dev/ns/v0.2.0",
+        "@id": f"urn:servoscope:vex:{release}:{advisories['taken']}",
+        "author": "The servoscope developers",
+        "timestamp": f"{advisories['taken']}T00:00:00Z",
+        "version": 1,
+        "statements": statements,
+    }
+
+
 def main() -> int:
-    """Compare, or renew."""
+    """Compare, renew, or write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--renew", type=Path, metavar="FILE")
+    parser.add_argument("--vex", type=Path, metavar="FILE")
     parser.add_argument("--root", type=Path, default=ROOT, help="folder of the lock files and of scripts")
     options = parser.parse_args()
     versions = locked_versions(options.root)
@@ -100,6 +134,9 @@ def main() -> int:
     if options.renew is not None:
         path.write_text(json.dumps(take_records(options.renew, versions), indent=1) + "\n", encoding="utf-8")
     advisories = json.loads(path.read_text(encoding="utf-8"))
+    if options.vex is not None:
+        document = state_exposure(advisories, options.root)
+        options.vex.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     holes = list(find_holes(advisories, versions))
     print(*holes, sep="\n", end="\n" if holes else "")
     print(

@@ -14,6 +14,8 @@ columns, rows) and "values" (name -> text). In a page stand
     <!-- value PROGRAM: NAME -->text<!-- end -->               a value in a sentence or a cell
     <!-- measured PROGRAM -->            ... <!-- end -->      commit, versions and date of the run
 
+A rate, as "9 of 10", gets its 95 % interval behind it in the page: the fewer recordings, the less it says.
+
 Results are stored in `benchmarks/figures/PROGRAM.json`, so that a page can be checked without measuring. Of columns and
 values that depend on the machine (listed as `volatile`), only the form is compared: every number counts as any other.
 """
@@ -34,9 +36,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from scipy.stats import binomtest
+
 ROOT = Path(__file__).resolve().parent.parent
 MARKER = re.compile(r"(?<!`)(<!-- (table|value|measured) ([\w-]+)(?:: ([^>]*?))? -->)(.*?)(<!-- end -->)", re.DOTALL)
 NUMBER = re.compile(r"\d+(?:[.,]\d+)?")
+RATE = re.compile(r"(?<![\d.])(\d+) of (\d+)(?![\d.]|\w)")
 
 
 @dataclass(frozen=True)
@@ -102,6 +107,21 @@ def load(root: Path, name: str) -> dict[str, Any]:
     return found
 
 
+def with_intervals(text: str) -> str:
+    """Return a text with the 95 % interval of each rate behind it (Clopper and Pearson, 1934): 9 of 10 (55-99.7 %)."""
+
+    def put(rate: re.Match[str]) -> str:
+        successes, trials = int(rate[1]), int(rate[2])
+        if not 0 <= successes <= trials or not trials:
+            return rate[0]
+        ends = binomtest(successes, trials).proportion_ci(method="exact")
+        # 99.9 % of 99.97 %, where whole numbers would make 100 %
+        low, high = (f"{100.0 * end:.{0 if end in (0.0, 1.0) or 0.01 <= end <= 0.99 else 1}f}" for end in ends)
+        return f"{rate[0]} ({low}\N{EN DASH}{high} %)"
+
+    return RATE.sub(put, text)
+
+
 def text_of(kind: str, key: str, results: Mapping[str, Any], where: str) -> str:
     """Return what belongs between a marker and its end."""
     if kind == "measured":
@@ -109,12 +129,13 @@ def text_of(kind: str, key: str, results: Mapping[str, Any], where: str) -> str:
     if kind == "value":
         if key not in results.get("values", {}):
             raise FigureError(f"{where}: no value {key!r}, there are {', '.join(results.get('values', {})) or 'none'}")
-        return str(results["values"][key])
+        return with_intervals(str(results["values"][key]))
     table = next((one for one in results["tables"] if one["title"] == key), None)
     if table is None:
         titles = ", ".join(repr(one["title"]) for one in results["tables"])
         raise FigureError(f"{where}: no table {key!r}, there are {titles}")
-    lines = [table["columns"], ["---"] * len(table["columns"]), *table["rows"]]
+    rows = [[with_intervals(cell) for cell in row] for row in table["rows"]]
+    lines = [table["columns"], ["---"] * len(table["columns"]), *rows]
     return f"\n{table['note']}\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
 
 

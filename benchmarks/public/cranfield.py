@@ -17,7 +17,7 @@ import numpy as np
 from tables import Table, parse_with_data, parser, show
 
 import servoscope as ss
-from public.servoscope_detector import OURS, ROOT, servoscope_scores
+from public.servoscope_detector import COMMON, OURS, ROOT, servoscope_scores
 from public.simple_detectors import detectors, judge
 
 LOADS = ("20", "40", "-40")
@@ -101,16 +101,16 @@ def main() -> None:
             found_runs = zip(faulty, ours.largest[len(held_out) :], ours.names[len(held_out) :], strict=True)
             for (fault, _), score, cause in found_runs:
                 named[fault] += [cause] if score > ours.limit else []
-            for name, (limit, largest, order, _) in scores.items():
+            for name, (limit, largest, order, common, _) in scores.items():
                 normal_scores, fault_scores = largest[: len(held_out)], largest[len(held_out) :]
                 false = sum(score > limit for score in normal_scores)
                 found = sum(score > limit for score in fault_scores)
                 places = order or largest
                 ranked = sum(place > max(places[: len(held_out)]) for place in places[len(held_out) :])
-                kept = counts.setdefault(name, [0, 0, 0, 0, 0])
-                counts[name] = [
-                    a + b for a, b in zip(kept, (false, len(held_out), found, ranked, len(faulty)), strict=True)
-                ]
+                shared = limit if common is None else common
+                by_common = (sum(score > shared for score in some) for some in (normal_scores, fault_scores))
+                new = (false, len(held_out), found, ranked, len(faulty), *by_common)
+                counts[name] = [a + b for a, b in zip(counts.get(name, [0] * len(new)), new, strict=True)]
                 for (fault, _), score in zip(faulty, fault_scores, strict=True):
                     both = of_fault.setdefault((fault, name), [0, 0])
                     both[0], both[1] = both[0] + (score > limit), both[1] + 1
@@ -122,10 +122,10 @@ def main() -> None:
                             score > limit for (one, _), score in zip(faulty, fault_scores, strict=True) if one == fault
                         ]
                         values[f"{load}.{fault}"] = f"{sum(at)} of {len(at)}"
-        for name, (false, normal_count, found, ranked, faulty_count) in counts.items():
-            rows.append(
-                (fold, name, f"{false} of {normal_count}", f"{found} of {faulty_count}", f"{ranked} of {faulty_count}")
-            )
+        for name, (false, normal_count, found, ranked, faulty_count, *by_common) in counts.items():
+            of_normal, of_faulty = f"of {normal_count}", f"of {faulty_count}"
+            common = f"{by_common[0]} {of_normal}", f"{by_common[1]} {of_faulty}"
+            rows.append((fold, name, f"{false} {of_normal}", f"{found} {of_faulty}", *common, f"{ranked} {of_faulty}"))
         names = list(counts)
         for fault in FAULTS:
             causes = [cause for cause in named[fault] if cause]
@@ -133,7 +133,7 @@ def main() -> None:
             counts_of = (len(named[fault]), len(causes) - len(wrong), len(wrong), len(named[fault]) - len(causes))
             told.append((fold, fault, *map(str, counts_of)))
             faults.append((fold, fault, *("{} of {}".format(*of_fault[fault, name]) for name in names)))
-    heads = ("learned from", "detector", "false", "found", "above the worst healthy run")
+    heads = ("learned from", "detector", "false", "found", *COMMON, "above the worst healthy run")
     note = (
         "Loads of 20, 40 and -40 kgf together, five healthy runs held out at each."
         if not given.load

@@ -13,7 +13,6 @@ from tables import Table, parse_with_data, parser, show
 import servoscope as ss
 from public.servoscope_detector import COLUMNS, OURS, ROOT, Count, all_scores, servoscope_scores, with_gain
 from public.servoscope_detector import with_model_error as with_error
-from public.simple_detectors import Scores
 
 WINDOW_S = 5.0
 GAIN = 1.1
@@ -34,9 +33,9 @@ def main() -> None:
         judged = [healthy, *(read[name] for name in LOADED), with_gain(healthy, GAIN)]
         scores = all_scores(with_error(loop, 0.0), [read[one]], judged, WINDOW_S)
         named = {plain: scores.pop(OURS), example: servoscope_scores(loop, [read[one]], judged), **scores}
-        for name, (limit, largest, *_) in named.items():
-            loads.setdefault(name, Count()).add(Scores(limit, largest[:-1]), 1)
-            gains.setdefault(name, Count()).add(Scores(limit, (largest[0], largest[-1])), 1)
+        for name, found in named.items():
+            loads.setdefault(name, Count()).add(found._replace(largest=found.largest[:-1]), 1)
+            gains.setdefault(name, Count()).add(found._replace(largest=(found.largest[0], found.largest[-1])), 1)
     note = "Learned from one recording of load 1, then from the other. 31 s at 1 kHz each. Windows of 5 s."
     tables = [
         Table(

@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 
 import servoscope as ss
-from public.simple_detectors import Scores, detectors, judge
+from public.simple_detectors import MARGIN, Scores, detectors, halves, judge
 from servoscope.baseline.threshold import NARROW_PRIOR, score_std
 from servoscope.diagnosis.diagnose import diagnose_with_trace
 
 ROOT = Path(__file__).resolve().parents[2]
 OURS = "servoscope"
+COMMON = "false, common limit", "found, common limit"  # 1.5 times the largest score of a healthy one left out
 DETECTORS = (OURS, "rms of u", "T^2 of features", "inverse + CUSUM")
 
 
@@ -26,6 +27,8 @@ class Count:
     healthy: int = 0
     found: int = 0
     changed: int = 0
+    false_common: int = 0
+    found_common: int = 0
     worst: float = 0.0  # largest score of a healthy recording, as a multiple of the limit
     least: float = np.inf  # smallest score of a changed one
 
@@ -36,25 +39,41 @@ class Count:
         self.found += sum(ratio > 1.0 for ratio in ratios[healthy:])
         self.healthy += healthy
         self.changed += len(ratios) - healthy
+        common = scores.limit if scores.common is None else scores.common
+        self.false_common += sum(score > common for score in scores.largest[:healthy])
+        self.found_common += sum(score > common for score in scores.largest[healthy:])
         self.worst = max([self.worst, *ratios[:healthy]])
         self.least = min([self.least, *ratios[healthy:]])
 
     @property
-    def cells(self) -> tuple[str, str, str, str]:
-        """False alarms, changes found, and both extreme scores."""
+    def cells(self) -> tuple[str, str, str, str, str, str]:
+        """False alarms and changes found, by the own limit and by the common one, and both extreme scores."""
         least = "" if np.isinf(self.least) else f"{self.least:.2f}"
-        return f"{self.false} of {self.healthy}", f"{self.found} of {self.changed}", f"{self.worst:.2f}", least
+        counts = (self.false, self.healthy), (self.found, self.changed)
+        common = (self.false_common, self.healthy), (self.found_common, self.changed)
+        rates = [f"{some} of {total}" for some, total in (*counts, *common)]
+        return (rates[0], rates[1], rates[2], rates[3], f"{self.worst:.2f}", least)
 
 
-COLUMNS = ("detector", "false", "found", "largest healthy score / limit", "smallest changed score / limit")
+COLUMNS = ("detector", "false", "found", *COMMON, "largest healthy score / limit", "smallest changed score / limit")
 
 
 def servoscope_scores(loop: ss.Loop, healthy: Sequence[ss.Recording], judged: Sequence[ss.Recording]) -> Scores:
-    """Return the largest statistic of each recording as a multiple of its limit; the limit is 1.
+    """Return the largest statistic of each recording as a multiple of its limit; the limit is 1, and that of all, too.
 
     Coefficients and features have scores of different spread: recordings are ranked by how far a score is from its
     limit in standard deviations of its logarithm over the healthy recordings, each learned without it.
     """
+    largest, order, names = _statistics(loop, healthy, judged)
+    parts = list(healthy) if len(healthy) > 1 else halves(healthy[0])
+    left_out = [_statistics(loop, [*parts[:i], *parts[i + 1 :]], [part])[0][0] for i, part in enumerate(parts)]
+    return Scores(1.0, largest, order, MARGIN * max(left_out), names)
+
+
+def _statistics(
+    loop: ss.Loop, healthy: Sequence[ss.Recording], judged: Sequence[ss.Recording]
+) -> tuple[tuple[float, ...], tuple[float, ...], tuple[str, ...]]:
+    """Return the largest statistic of each recording, what ranks it, and the causes that are named."""
     baseline = ss.learn(loop, healthy)
     features = baseline.features
     stds = (
@@ -70,7 +89,7 @@ def servoscope_scores(loop: ss.Loop, healthy: Sequence[ss.Recording], judged: Se
         ratios = {one.name: float((one.value / one.limit)[ready].max(initial=0.0)) for one in trace.statistics}
         largest.append(max(ratios.values()))
         order.append(max(ratio ** (1.0 / stds.get(name, 1.0)) for name, ratio in ratios.items()))
-    return Scores(1.0, tuple(largest), tuple(order), tuple(names))
+    return tuple(largest), tuple(order), tuple(names)
 
 
 def all_scores(

@@ -30,6 +30,8 @@ class Scores(NamedTuple):
     largest: tuple[float, ...]
     # what recordings are ranked by, where a detector has several scores; otherwise the largest
     order: tuple[float, ...] | None = None
+    # 1.5 times the largest score of a healthy recording that is left out, where the limit is another
+    common: float | None = None
     # the causes named with certainty, joined by plus signs, where a detector names any
     names: tuple[str, ...] = ()
 

@@ -36,6 +36,7 @@ __all__ = [
     "read",
     "read_parts",
     "relearn",
+    "reproduce",
     "simulate",
     "write_report",
 ]
@@ -57,6 +58,7 @@ if TYPE_CHECKING:
     from servoscope.models.loop import Columns, Loop
     from servoscope.report.diagnosis_page import write_report
     from servoscope.report.plots import plot
+    from servoscope.research.paper.reproduction import reproduce
     from servoscope.signals.readers import read, read_parts
     from servoscope.signals.recording import Recording
     from servoscope.simulation import simulate
@@ -82,6 +84,7 @@ else:  # hidden from type checkers, which would otherwise accept any name
         "read": "signals.readers",
         "read_parts": "signals.readers",
         "relearn": "diagnosis.relearn",
+        "reproduce": "research.paper.reproduction",
         "simulate": "simulation",
         "write_report": "report.diagnosis_page",
     }

@@ -74,6 +74,14 @@ def test_written_pages_agree(figures: ModuleType, copy: Path) -> None:
     assert figures.main([], copy) == 0
 
 
+def test_a_rate_has_its_interval(figures: ModuleType) -> None:
+    """Ends after Clopper and Pearson (1934): 1 - 0.025^(1/n) where nothing was found in n."""
+    assert figures.with_intervals("0 of 4; 10 of 10") == "0 of 4 (0\N{EN DASH}60 %); 10 of 10 (69\N{EN DASH}100 %)"
+    assert round(100.0 * (1.0 - 0.025 ** (1.0 / 4.0))) == 60
+    assert figures.with_intervals("6 of 300") == "6 of 300 (0.7\N{EN DASH}4 %)"
+    assert figures.with_intervals("3 of 2; 0 of 0; runs 1 to 5") == "3 of 2; 0 of 0; runs 1 to 5"
+
+
 @pytest.mark.parametrize(
     ("marker", "message"),
     [

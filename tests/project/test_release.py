@@ -190,6 +190,16 @@ def test_no_locked_package_has_a_known_hole_and_one_that_has_is_found(project: P
     shutil.copy(project / "scripts" / "advisories.json", tmp_path / "scripts")
     code, said = audit("--root", str(tmp_path))
     assert code == 1 and said.startswith("h11 0.15.0: CVE-2025-43859: ") and "take 0.16.0\n3 packages" in said
+    package = tmp_path / "src" / "servoscope" / "__init__.py"
+    package.parent.mkdir(parents=True)
+    package.write_text('__version__ = "9.9"\n')
+    assert audit("--root", str(tmp_path), "--vex", str(tmp_path / "vex.json"))[0] == 1
+    vex = json.loads((tmp_path / "vex.json").read_text())
+    (applies,) = (one for one in vex["statements"] if one["vulnerability"]["name"] == "CVE-2025-43859")
+    assert applies["status"] == "affected" and "h11" in applies["action_statement"]
+    assert audit("--vex", str(tmp_path / "vex.json"))[0] == 0
+    statements = json.loads((tmp_path / "vex.json").read_text())["statements"]
+    assert statements and {one["status"] for one in statements} == {"not_affected"}
     code, said = audit("--root", str(tmp_path), "--renew", str(tmp_path / "all.zip"))
     assert code == 1 and said.startswith(
         "a-b 2.0rc1: ranged: a hole; there is no release without it\n3 packages, 2 advi"

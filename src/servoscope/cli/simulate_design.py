@@ -157,12 +157,10 @@ def reproduce(
     from servoscope.cli.render import results
     from servoscope.research.paper import jobs, reproduction
 
-    numbers = range(1, seeds + 1)
-    count = len(jobs.list_jobs(numbers)) + reproduction.FIGURE_COUNT + 1
+    count = len(jobs.list_jobs(range(1, seeds + 1))) + reproduction.FIGURE_COUNT + 1
     with exclusive_folder(output), show_steps(count, 1) as steps:
         steps.begin("measuring")
-        paper = reproduction.run_reproduction(numbers, steps.begin)
-        reproduction.write_reproduction(paper, output, steps.begin)
+        paper = reproduction.reproduce(seeds, output, progress=steps.begin)
     if as_json:
         print_json(paper.to_dict(), lines=False)
     else:

@@ -42,6 +42,45 @@ class Reproduction:
         return {"seeds": list(self.seeds), "claims": [claim.to_dict() for claim in self.claims]}
 
 
+def reproduce(
+    seeds: int = 1, output: Path | str | None = None, *, progress: StepCallback = lambda _: None
+) -> Reproduction:
+    """Reproduce the source paper: measure each of its claims on simulated data, as ``servoscope reproduce`` does.
+
+    Parameters
+    ----------
+    seeds
+        Realisations of the noise, at least 1; each takes some twenty seconds of processor time.
+    output
+        Folder for figures and claims; without one nothing is written.
+    progress
+        Takes the name of each step that is done.
+
+    Returns
+    -------
+    Reproduction
+        ``claims``, each with ``claim``, ``measured`` and ``verdict``, and ``metrics``, one value per seed.
+
+    Raises
+    ------
+    ValueError
+        If there is no seed.
+    OutputError
+        If the folder or a file cannot be written.
+
+    Examples
+    --------
+    >>> paper = ss.reproduce()  # doctest: +SKIP
+    >>> [claim.verdict for claim in paper.claims]  # doctest: +SKIP
+    """
+    if seeds < 1:
+        raise ValueError(f"seeds: is {seeds}, but at least 1 is needed")
+    reproduction = run_reproduction(range(1, seeds + 1), progress)
+    if output is not None:
+        write_reproduction(reproduction, Path(output), progress)
+    return reproduction
+
+
 def run_reproduction(seeds: Sequence[int], told: StepCallback = lambda _: None) -> Reproduction:
     """Measure everything, on all cores; `told` takes the name of each job that is done."""
     work = jobs.list_jobs(seeds)
