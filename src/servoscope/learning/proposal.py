@@ -13,12 +13,14 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from pydantic import ValidationError
 
+from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.errors import IrregularTimeError, LoopError, NotEnoughError, RecordingError, ServoscopeError
 from servoscope.core.messages import Message, message
 from servoscope.core.settings_errors import describe_error
 from servoscope.learning.hold import likelier_hold
 from servoscope.learning.inspection import Inspection, inspect
 from servoscope.learning.inspection.cutoff import measure_cutoff
+from servoscope.learning.inspection.inspect import inspect_motion
 from servoscope.learning.loop_proposal import LoopProposal, ProposalLine, quoted
 from servoscope.learning.monitor_proposal import hold_at_rest, hold_lines, monitor_lines, monitor_settings
 from servoscope.learning.plant_choice import PlantCandidate, choose_plant
@@ -234,8 +236,8 @@ def _read_evenly(
 def _inspect(recording: Recording, is_speed: bool) -> Inspection:
     """Inspect a recording before its plant is known; where y is a speed, that of a steady motion is no rest."""
     if not is_speed:
-        return inspect(recording)
-    return inspect(recording, Loop.from_dict({"sample_rate": recording.sample_rate, "plant": SPEED_AXIS}))
+        return inspect_motion(recording, None)
+    return inspect_motion(recording, Loop.from_dict({"sample_rate": recording.sample_rate, "plant": SPEED_AXIS}))
 
 
 def _further_columns(
@@ -274,6 +276,7 @@ def _further_columns(
     return [ProposalLine("columns", "# covariates", f"{{{value}}}", message("init.covariates"))], notes
 
 
+@with_one_blas_thread
 def init(
     path: Source | Sequence[Source],
     columns: Columns | str | None = None,

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from servoscope.core.arrays import BoolArray, FloatArray, IndexArray
+from servoscope.core.blas import with_one_blas_thread
 from servoscope.core.messages import Message, MessageText, message
 from servoscope.core.short_repr import ShortRepr
 from servoscope.estimation.reference_period import reference_period
@@ -90,6 +91,7 @@ class Inspection(ShortRepr, InspectionMeasurements):
         return self._traces
 
 
+@with_one_blas_thread
 def inspect(recording: Recording | Source, loop: Loop | str | Path | None = None) -> Inspection:
     """Say whether a recording is usable, and if not, why; never raises because of what is in the recording.
 
@@ -112,7 +114,17 @@ def inspect(recording: Recording | Source, loop: Loop | str | Path | None = None
     'usable'
     """
     loop = Loop.of(loop) if loop is not None else None
-    whole = recording = as_recording(recording, loop)
+    return _inspect(as_recording(recording, loop), loop, with_fit=True)
+
+
+@with_one_blas_thread
+def inspect_motion(recording: Recording, loop: Loop | None) -> Inspection:
+    """Inspect a recording as far as its plant is not needed: no coefficients, residual, delay and simulation."""
+    return _inspect(recording, loop, with_fit=False)
+
+
+def _inspect(recording: Recording, loop: Loop | None, *, with_fit: bool) -> Inspection:
+    whole = recording
     if whole.samples > MAX_ROWS:
         recording = thin_out(whole, MAX_ROWS, MIN_STRETCH_ROWS)
     quantisation = tuple(signals.quantisation(name, getattr(recording, name)) for name in ("r", "u", "y"))
@@ -128,7 +140,8 @@ def inspect(recording: Recording | Source, loop: Loop | str | Path | None = None
         return _conclude(InspectionMeasurements.model_validate(basics), loop, constant, None)
     basics["saturation"] = signals.saturation(recording, loop)
     basics["swapped"] = signals.detect_swapped_channels(recording)
-    measured, traces = _measure_with_model(recording, loop, InspectionMeasurements.model_validate(basics))
+    basis = InspectionMeasurements.model_validate(basics)
+    measured, traces = _measure_with_model(recording, loop, basis, with_fit=with_fit)
     return _conclude(measured, loop, constant, traces)
 
 
@@ -160,9 +173,9 @@ def _conclude(
 
 
 def _measure_with_model(
-    recording: Recording, loop: Loop | None, m: InspectionMeasurements
+    recording: Recording, loop: Loop | None, m: InspectionMeasurements, *, with_fit: bool
 ) -> tuple[InspectionMeasurements, InspectionTraces]:
-    """Add spectra and all that needs a model."""
+    """Add spectra and what needs a model, of which the order comes before the fit."""
     period = reference_period(recording)
     spectra = excitation.spectra(recording, period)
     m = m.model_copy(update={"periods": recording.samples / period if period is not None else None})
@@ -196,7 +209,7 @@ def _measure_with_model(
             "best_order": best,
         }
     )
-    if best is None:
+    if best is None or not with_fit:
         return m, traces
     which = model_order.column_indices(g, best.order, best.friction, best.stiffness)
     model = describe_order(best)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,7 @@ def open_csv(path: Path, text: TextLayout | None = None) -> TableFile:
     return TableFile(path, layout.columns, lambda *wanted: read_csv(path, layout, *wanted))
 
 
+@lru_cache(maxsize=4)  # a log is opened once for its columns, and again for each use of its rows
 def detect_layout(path: Path, head: bytes, most: int, text: TextLayout, cut: bool) -> CsvLayout | None:
     """Find out how a text file is laid out from its first bytes, and `most` lines of them; `cut`: it has more.
 
