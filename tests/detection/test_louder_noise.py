@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from importlib.resources import files
+from typing import Any
 
 import numpy as np
 import pytest
@@ -77,3 +78,33 @@ def test_a_fault_keeps_its_name(baseline: ss.Baseline) -> None:
     assert fault.interval[0] <= 1.5 <= fault.interval[1]
     assert diagnosis.onset_s is not None
     assert diagnosis.onset_s[0] <= 16.0 <= diagnosis.onset_s[2]
+
+
+AXIS: dict[str, Any] = {
+    "kind": "axis", "terms": ["viscous", "coulomb", "offset"],
+    "coefficients": {"inertia": 2.0, "viscous_friction": 8.0, "coulomb_friction": 3.0, "offset": 0.5},
+}  # fmt: skip
+
+
+def moved_axis(seed: int, *faults: FaultEvent) -> ss.Recording:
+    t = np.arange(2400) / 100.0
+    loop = ss.Loop.from_dict(
+        {"sample_rate": 100.0, "plant": AXIS, "controller": {"kind": "pi", "k_p": 400.0, "k_i": 0.0}}
+    )
+    r = 0.5 * np.sin((2.0 + 0.1 * seed) * t) + 0.2 * np.sin(5.1 * t)
+    return simulate(loop, r, faults=faults, noise_u_std=0.05, noise_y_std=1e-5, seed=seed)[0]
+
+
+def test_a_sensor_of_an_axis_that_fails_is_told_and_a_fault_before_keeps_its_name() -> None:
+    """Noise of y takes the inertia away from the estimate: "the moved mass has fallen by 80 %"."""
+    loop = ss.Loop.from_dict({"sample_rate": 100.0, "plant": {"kind": "axis"}, "monitor": {"memory": 2.0}})
+    learned = ss.learn(loop, [moved_axis(seed) for seed in range(2)])
+    weaker = FaultEvent("input_gain", 0.8, 12.0)
+    for recording, names in ((moved_axis(3), []), (moved_axis(3, weaker), ["motor_constant"])):
+        y = recording.y.copy()
+        y[1600:] += 3e-3 * np.random.default_rng(4).normal(size=800)
+        diagnosis = ss.diagnose(learned, replace(recording, y=y))
+        assert [fault.name for fault in diagnosis.faults] == names
+        assert diagnosis.verdict == ("fault" if names else "undetermined")
+        assert "times as noisy from 16" in str(diagnosis.warnings[-1].description)
+        assert all(warning.kind != "noise" for warning in ss.diagnose(learned, recording).warnings)

@@ -26,6 +26,7 @@ from servoscope.signals.quality import (
     limit_verdict,
     restart_silence,
     tick,
+    upgrade_state,
 )
 from servoscope.signals.readers import read
 
@@ -97,6 +98,39 @@ def test_a_frozen_channel_is_found_while_the_motion_demands_a_change_and_ends_wi
         (f"frozen_{channel}", True),
         (f"frozen_{channel}", False),
     ]
+
+
+@pytest.mark.parametrize("logged", ["u itself", "constant", "a plan"])
+def test_a_staircase_that_nobody_controls_is_not_frozen(logged: str) -> None:
+    """A jog or an experiment in open loop holds u for ten seconds; y goes on moving, and so does r - y."""
+    time = np.arange(12000) / 100.0
+    u = np.repeat(np.random.default_rng(1).normal(size=12), 1000)
+    y = np.cumsum(u) / 100.0 + 1e-3 * np.random.default_rng(2).normal(size=12000)
+    r = {"u itself": u, "constant": np.zeros(12000), "a plan": np.sin(time)}[logged]
+    assert found(Block(EPOCH + time, r, u, y)) == SOUND
+
+
+def test_no_reference_or_one_that_is_u_itself_says_nothing_of_u() -> None:
+    """u changes at each sample until a hand holds it."""
+    block = axis(n=12000)
+    block.u[8000:9500] = 0.1
+    for r in (block.u, np.zeros(12000)):
+        assert ("frozen_u", True) not in found(block._replace(r=r))
+    assert ("frozen_u", True) in found(block)
+
+
+def test_a_state_of_version_1_goes_on() -> None:
+    """It held no changes of u: one that is stuck is found once enough have been counted."""
+    block = axis()
+    block.u[4200:5500] = block.u[4200]
+    half = Block(*(x[:1000] for x in block)), Block(*(x[1000:] for x in block))
+    state = check_block(LIMITS, init_state(), *half[0])[0]
+    old = np.concatenate([[1.0], state[1:-2]])
+    with pytest.raises(StateError, match="another version"):
+        check_block(LIMITS, old, *half[1])
+    findings = check_block(LIMITS, upgrade_state(old), *half[1])[1]
+    assert [(one.kind, one.begins) for one in findings] == [("frozen_u", True), ("frozen_u", False)]
+    assert upgrade_state(state) is state
 
 
 def test_a_controller_at_its_limit_is_not_frozen() -> None:

@@ -221,7 +221,7 @@ def _judge_signals(
     again = partial(_judge_signals, baseline, progress=progress, point=point, before=before)
     if (put_right := judge_put_right(points, recording, rivals[0], again)) is not None:
         return put_right
-    noise = find_louder_noise(recording, baseline.loop.monitor.memory) if baseline.axis is None else None
+    noise = find_louder_noise(recording, baseline.loop.monitor.memory)
     if noise is not None and grows_innovations(points[0].pipeline(), recording, noise):
         return judge_both_sides(recording, noise, again)
     diagnoses = sorted(

@@ -29,7 +29,6 @@ HEALTHY_RESIDUAL_RATIO = 2.0
 FROZEN_S = 1.0  # how long y or u stays exactly the same while the motion demands a change [s],
 MIN_FROZEN_SAMPLES = 10  # or, where that is longer, so many samples: a loop of 0.1 Hz answers a step after one or two
 TRAVEL_SHARE = 0.1  # of the range of y, that r moves by then
-MIN_HELD_SHARE = 0.1  # of the samples, in which u changes where a controller sets it: else it is a staircase
 FORCE_SHARE = 0.3  # of the range of u, that static friction may hold
 UNASKED_SHARE = 0.5  # of a motion, that r - y moves too where y does not follow r
 SILENCE_SHARE = 1e-6  # of the largest u: what a resampling filter leaves of 0
@@ -266,23 +265,13 @@ def _frozen_defect(recording: Recording, finding: QualityFinding, late: int) -> 
     moved = np.flatnonzero(x[begin:] != x[begin])
     stretch = slice(begin, begin + int(moved[0]) if len(moved) else recording.samples)
     low, high = outofcore.extremes(x)
-    if name == "u" and (not low < x[at] < high or _is_set_by_hand(recording, stretch)):
-        return None  # it is limited, or has no reason to change
+    if name == "u" and not low < x[at] < high:
+        return None  # it is limited
     if name == "y" and (_follows_late(recording, stretch, late) or _is_held(recording, stretch)):
         return None
     other = "r" if name == "y" else "r - y"
     text = message("signals.frozen", name=name, t=float(recording.t[begin]), other=other, by=finding.value)
     return SignalDefect(begin, text)
-
-
-def _is_set_by_hand(recording: Recording, stretch: slice) -> bool:
-    """Return whether no controller sets u: no reference is logged, or u is a staircase outside of a stretch, too."""
-    r, u = recording.r, recording.u
-    if np.ptp(outofcore.extremes(r)) == 0.0 or np.array_equal(r, u):
-        return True
-    rows = outofcore.iter_chunks(0, recording.samples, u)
-    changes = sum(int(np.count_nonzero(np.diff(u[chunk]))) for chunk in rows)
-    return bool(changes < MIN_HELD_SHARE * (recording.samples - (stretch.stop - stretch.start)))
 
 
 def _is_held(recording: Recording, stretch: slice) -> bool:

@@ -24,7 +24,7 @@ from servoscope.signals.quality import QualitySettings
 from servoscope.signals.quality import kernel as quality
 
 NAME = "servo_monitor"
-SIGNAL_BYTES = 2 * 4 + 4 * 4 + 3 * 8 + 8 * (3 + 3 + 1 + 16 + 4 * 2)  # of the struct `signals` in monitor.h
+SIGNAL_BYTES = 2 * 4 + 4 * 4 + 3 * 8 + 8 * (2 + 3 + 3 + 1 + 16 + 4 * 2)  # of the struct `signals` in monitor.h
 UNSEEN_MOTION = (
     "Under motions that the healthy recordings do not hold an alarm may be no fault: the server looks at that."
 )

@@ -84,6 +84,31 @@ static int y_should_move(const @{prefix}_signals *s)
     return moved;
 }
 
+/* Tell whether a controller sets u: r is logged, and u no staircase. */
+static int is_controlled(const @{prefix}_signals *s, double u)
+{
+    const double share = @{quality.CHANGED_SHARE | c} * (double)(s->u_samples - s->same[SIGNAL_U]);
+    double of_r[2];
+
+    recent_range(s, SIGNAL_R, of_r);
+    return ((double)s->u_changes >= @{quality.MIN_CHANGES | c}) && ((double)s->u_changes >= share) &&
+           ((s->last[SIGNAL_R] < u) || (s->last[SIGNAL_R] > u)) && (width(of_r) > 0.0);
+}
+
+/* Count samples and changes of u since it was last the same for as long as what is frozen. */
+static void count_changes_of_u(@{prefix}_signals *s, double u)
+{
+    const int changed = (s->started != 0) && (fabs(u - s->last[SIGNAL_U]) > 0.0);
+
+    if ((changed != 0) && (s->same[SIGNAL_U] > @{upper}_FROZEN_SAMPLES)) {
+        s->u_changes = 0u;
+        s->u_samples = 0u;
+    } else {
+        s->u_changes += (changed != 0) ? 1u : 0u;
+        s->u_samples++;
+    }
+}
+
 /* Tell whether the controller has had to act; at the end of its range u is limited, and not frozen. */
 static int u_should_move(const @{prefix}_signals *s, double u)
 {
@@ -95,7 +120,7 @@ static int u_should_move(const @{prefix}_signals *s, double u)
     recent_range(s, SIGNAL_U, of_u);
     recent_range(s, SIGNAL_E, of_e);
     share = @{quality.MOTION_SHARE | c} * width(of_e);
-    return (of_u[0] < u) && (u < of_u[1]) && (width(of_u) > steps) && (width(s->e_while_u) > share) &&
+    return (is_controlled(s, u) != 0) && (of_u[0] < u) && (u < of_u[1]) && (width(of_u) > steps) && (width(s->e_while_u) > share) &&
            (has_moved(s, s->y_while_u, SIGNAL_Y) != 0);
 }
 
@@ -106,6 +131,7 @@ static void take_values(@{prefix}_signals *s, const double x[4])
     const int turned = (s->direction * step) < 0.0;
     int i;
 
+    count_changes_of_u(s, x[SIGNAL_U]);
     for (i = 0; i < 4; i++) {
         if (s->started == 0) {
             track_range(s->ranges[0][i], x[i], 1);

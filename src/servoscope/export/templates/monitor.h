@@ -55,6 +55,8 @@ typedef struct {
     int frozen_y;         /* 1: found */
     int frozen_u;         /* 1: found */
     uint64_t same[3];     /* samples for which it has stayed the same */
+    uint64_t u_changes;   /* changes of u, and samples, since it last was the same for long */
+    uint64_t u_samples;
     double last[3];
     double smallest_change[3];
     double direction;     /* last change of y */

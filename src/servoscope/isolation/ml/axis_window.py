@@ -28,6 +28,7 @@ from servoscope.isolation.ml.window import (
 )
 from servoscope.models.loop import Loop
 from servoscope.models.plants.axis import AxisPlant
+from servoscope.models.plants.base import FaultRay, expand_rays
 from servoscope.signals import Recording
 
 RECORDING_NUISANCES = (
@@ -131,6 +132,15 @@ class AxisWindow(ChangeWindow):
         return np.asarray(self.counted / np.sqrt(self.filter.variance))
 
     @cached_property
+    def _rays(self) -> tuple[FaultRay, ...]:
+        return self.plant.rays
+
+    @cached_property
+    def _grows_with_y(self) -> BoolArray:
+        """Columns that grow with y as measured, and so with its gain, shape (1 + n,)."""
+        return np.array([False, *(column.degree != 0 for column in self.plant.acting)])
+
+    @cached_property
     def _of_output(self) -> FloatArray:
         return self.filter.of_output(self.y, self.signals.runs)
 
@@ -149,12 +159,10 @@ class AxisWindow(ChangeWindow):
     def _coefficients(self, factors: dict[str, Any], added: Array) -> Array:
         factors = dict(factors)
         output_gain = factors.pop(SENSOR_GAIN, 1.0)
-        plant = self.plant.scaled(self.plant.expand_rays(factors))
+        plant = self.plant.scaled(expand_rays(self._rays, factors))
         assert plant.coefficients is not None
         coefficients = plant.acceleration_coefficients()
-        # what grows with y as measured does so through its gain already
-        degrees = np.array([0, *(column.degree for column in plant.acting)])
-        coefficients = np.where(degrees == 0, output_gain, 1.0) * coefficients
+        coefficients = np.where(self._grows_with_y, 1.0, output_gain) * coefficients
         return np.concatenate([coefficients, output_gain * np.asarray(added) / plant.coefficients["inertia"]])
 
     def _shares(self, profile: ChangeProfile, predictors: int) -> FloatArray:

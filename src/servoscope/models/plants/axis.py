@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -108,6 +109,13 @@ PAYLOAD_FAULTS = {
 GRAVITY_ACCELERATION = 9.81  # m/s^2
 
 
+@cache  # a search asks for them at each of its thousands of steps
+def _columns_of(terms: tuple[TermName, ...]) -> tuple[TermColumn, ...]:
+    columns = [column for term in TERMS if term in terms for column in TERMS[term]]
+    powers = [column for column in columns if isinstance(column.column, int)]
+    return (*powers, TermColumn("inertia", 2, 1), *(column for column in columns if column not in powers))
+
+
 class AxisPlant(TermPlant):
     """Motor axis ``input_gain u = inertia y'' + sum of terms``, each a coefficient times a function of y and y'.
 
@@ -155,9 +163,7 @@ class AxisPlant(TermPlant):
     @property
     def columns(self) -> tuple[TermColumn, ...]:
         """The columns of all terms and of the inertia, powers of s first."""
-        columns = [column for term in TERMS if term in self.terms for column in TERMS[term]]
-        powers = [column for column in columns if isinstance(column.column, int)]
-        return (*powers, TermColumn("inertia", 2, 1), *(column for column in columns if column not in powers))
+        return _columns_of(self.terms)
 
     @property
     def derivative(self) -> int:

@@ -83,6 +83,17 @@ class FaultRay:
         return Fault(self.name, self.name, (ends[0], ends[1]), f"{words} at full size")
 
 
+def expand_rays(rays: Sequence[FaultRay], factors: Mapping[str, Any]) -> dict[str, Any]:
+    """Return factors by parameter, in which those of rays have become those of what they move."""
+    expanded = dict(factors)
+    for ray in rays:
+        if ray.name in expanded:
+            size = expanded.pop(ray.name)
+            for name, exponent in ray.exponents.items():
+                expanded[name] = expanded.get(name, 1.0) * size**exponent
+    return expanded
+
+
 class Plant(BaseModel, abc.ABC):
     """Settings and physics of a plant without finite zeros.
 
@@ -248,14 +259,8 @@ class Plant(BaseModel, abc.ABC):
         return {parameter: 1.0} if parameter in self.names else dict.fromkeys(self.names, 1.0)
 
     def expand_rays(self, factors: Mapping[str, Any]) -> dict[str, Any]:
-        """Return factors by parameter, in which those of rays have become those of what they move."""
-        expanded = dict(factors)
-        for ray in self.rays:
-            if ray.name in expanded:
-                size = expanded.pop(ray.name)
-                for name, exponent in ray.exponents.items():
-                    expanded[name] = expanded.get(name, 1.0) * size**exponent
-        return expanded
+        """Return what `expand_rays` does, with its own rays."""
+        return expand_rays(self.rays, factors)
 
     def added_mass(self, parameter: str, ratio: float) -> float | None:
         """Return the mass [kg] that was added where a parameter has a ratio to its nominal value; None: not known."""

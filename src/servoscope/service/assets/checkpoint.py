@@ -18,6 +18,7 @@ from servoscope.service.assets.examination_schedule import ExaminationState, Pen
 from servoscope.service.assets.outlook import Outlook
 from servoscope.service.assets.residual_history import EvaluationStatus, HistoryState, LatestEvaluation
 from servoscope.service.store.engine import encode_document
+from servoscope.signals.quality import upgrade_state
 
 MAGIC = b"servoscope state"
 VERSION = 1  # of this format and of all states in it: raised when one of them changes its meaning
@@ -145,7 +146,7 @@ def unpack_state(packed: bytes, asset: str) -> AssetState:
         baseline=document["baseline"],
         position=StreamPosition(**document["counted"]),
         monitor=numbers[: sizes[0]].copy(),
-        quality=numbers[sizes[0] :].copy(),
+        quality=upgrade_state(numbers[sizes[0] :].copy()),
         examination=ExaminationState(**document["judged"]),
         last_t=document["last"],
         samples=document["fed"],

@@ -15,6 +15,7 @@ from servoscope.signals.quality.monitor import (
     init_state,
     restart_silence,
     tick,
+    upgrade_state,
 )
 from servoscope.signals.quality.settings import (
     KINDS,
@@ -39,4 +40,5 @@ __all__ = [
     "limit_verdict",
     "restart_silence",
     "tick",
+    "upgrade_state",
 ]

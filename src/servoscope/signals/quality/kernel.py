@@ -19,6 +19,8 @@ EPOCH_WINDOWS = 60  # windows after which old ranges are forgotten, and with the
 MOTION_SHARE = 0.1  # of its range: a signal that moves by less has not moved
 MOTION_STEPS = 3.0  # smallest changes: likewise
 NOISE_LEVELS = 8.0  # smallest changes that noise at rest has to cover ...
+MIN_CHANGES = 10.0  # of u, and ...
+CHANGED_SHARE = 0.1  # ... share of samples at which it changes, where a controller sets it: else it is a staircase
 TURN_SHARE = 0.4  # ... and share of samples at which it turns; white noise turns at two of three
 
 
@@ -110,6 +112,8 @@ class SampleCheck:
         for i, x in enumerate((*signals, e)):
             _widen(s.ranges[0, i], x)
         turned = s.direction * (y - s.last[Y]) < 0.0
+        frozen = self.printer.number(limits.frozen)
+        self._count_changes_of_u(~is_first & (abs(u - s.last[U]) > 0.0), frozen)
         for i, x in enumerate(signals):
             change, smallest = abs(x - s.last[i]), s.smallest_change[i]
             moved = change > 0.0
@@ -124,13 +128,12 @@ class SampleCheck:
         _track_range(s.y_range, y, new_u)
         _track_range(s.e_range, e, new_u)
         self._learn_rest_noise(y, turned)
-        frozen = self.printer.number(limits.frozen)
         for kind, signal, span, new in ((FROZEN_Y, Y, s.r_range, new_y), (FROZEN_U, U, s.e_range, new_u)):
             active = ~self._is_quiet(kind)
             with when(active & new):
                 self._write_finding(kind, 0.0, t, 0.0, frozen * limits.period)
             with when(~active & (s.same[signal] > frozen)):
-                should_move = self._y_should_move() if signal == Y else self._u_should_move(u)
+                should_move = self._y_should_move() if signal == Y else self._u_should_move(r, u)
                 with when(should_move):
                     self._write_finding(kind, 1.0, t, _width(span), frozen * limits.period)
 
@@ -156,13 +159,25 @@ class SampleCheck:
         moved = where(s.smallest_change[Y] > 0.0, self._least_motion(Y), self._least_motion(R))
         return (s.noisy > 0.0) | (_width(s.r_range) > where(travel > 0.0, travel, moved))
 
-    def _u_should_move(self, u: Any) -> Any:
-        """Return whether the controller has had to act; at the end of its range u is limited, and not frozen."""
+    def _count_changes_of_u(self, changed: Any, frozen: Any) -> None:
+        """Count samples and changes of u since it was last the same for as long as what is frozen."""
         s = self.s
+        anew = changed & (s.same[U] > frozen)
+        s.u_changes = where(anew, 0.0, s.u_changes + where(changed, 1.0, 0.0))
+        s.u_samples = where(anew, 0.0, s.u_samples + 1.0)
+
+    def _u_should_move(self, r: Any, u: Any) -> Any:
+        """Return whether there is a controller, and has had to act; at the end of its range u is limited, not frozen.
+
+        None is where u is a staircase, or where r is constant or u itself, as logs of open loops have it.
+        """
+        s = self.s
+        least = maximum((s.u_samples - s.same[U]) * CHANGED_SHARE, MIN_CHANGES)
+        is_controlled = (s.u_changes >= least) & ~r.is_equal(u) & (self._range(R) > 0.0)
         lowest, highest = (limit(s.ranges[0, U, j], s.ranges[1, U, j]) for j, limit in enumerate((minimum, maximum)))
         inside = (lowest < u) & (u < highest) & (highest - lowest > s.smallest_change[U] * MOTION_STEPS)
         acted = _width(s.e_range) > self._range(E) * MOTION_SHARE
-        return inside & acted & (_width(s.y_range) > self._least_motion(Y))
+        return is_controlled & inside & acted & (_width(s.y_range) > self._least_motion(Y))
 
     def _least_motion(self, i: int) -> Any:
         """Return how far a signal goes without moving: a share of its range, a few of its steps."""

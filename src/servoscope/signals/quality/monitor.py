@@ -24,6 +24,15 @@ def init_state() -> FloatArray:
     return state
 
 
+def upgrade_state(state: FloatArray) -> FloatArray:
+    """Return a saved state as this version has it: one of version 1 knows nothing of how often u changes."""
+    if state.shape != (SIZE_OF_VERSION_1,) or state[0] != 1.0:
+        return state
+    new = init_state()
+    new[1:SIZE_OF_VERSION_1] = state[1:]
+    return new
+
+
 def check_block(
     limits: QualityLimits, state: FloatArray, t: npt.ArrayLike, r: npt.ArrayLike, u: npt.ArrayLike, y: npt.ArrayLike
 ) -> tuple[FloatArray, tuple[QualityFinding, ...]]:
@@ -119,7 +128,7 @@ def _copy_state(state: FloatArray) -> FloatArray:
     return state.copy()
 
 
-STATE_VERSION = 1
+STATE_VERSION = 2
 
 # All of them numbers of the same type: for saving, an array (size,) of float64; for the kernel, a record.
 STATE_DTYPE = np.dtype(
@@ -160,8 +169,12 @@ STATE_DTYPE = np.dtype(
         # which findings are active, 1 or 0, and since when (epoch, s); the order is that of KINDS
         ("active", np.float64, (len(KINDS),)),
         ("since", np.float64, (len(KINDS),)),
+        # changes of u, and samples, since it was last the same for long
+        ("u_changes", np.float64),
+        ("u_samples", np.float64),
     ]
 )
 STATE_SIZE = STATE_DTYPE.itemsize // 8
+SIZE_OF_VERSION_1 = STATE_SIZE - 2  # it does not count the changes of u
 # where in a state the flags are
 ACTIVE = slice((_begin := STATE_DTYPE.fields["active"][1] // 8), _begin + len(KINDS))  # type: ignore[index]

@@ -34,6 +34,7 @@ PRESSURE_SIDES = {
 VALVES = {"valve", "servo", "ventil"}
 # words of what a controller puts out, also within a name
 FIRM_ACTUATION = {*ACTUATION} - {*VALVES, "u", "input", "control", "controller", "ctrl"}
+PLANT = {"plant", "process", "actuator", "motor"}
 SPEED_COST = 2.5  # of a speed as y against a position: a log that has both is of a position loop
 PLANNED_COST = 0.3  # of a target, which may be the end of the move, against a set point
 FIELDS = {"t": "time", "r": "reference", "u": "input", "y": "output"}
@@ -199,6 +200,8 @@ def _input_cost(meaning: NameParts) -> tuple[float, int] | None:
         return (6.0, place) if own & VALVES else None
     if len(meaning.own) == 1 and place < len(ACTUATION):
         return 0.0, place
+    if "input" in own and own & PLANT:  # what arrives there: the controller's output, feedforward and limits
+        return 0.5, place
     if own & FIRM_ACTUATION or (own & {"control", "pid"} and own & {"signal", "output", "out"}):
         return 1.0, place
     if own & {*COMMANDS}:
