@@ -18,6 +18,7 @@ import servoscope as ss
 from golden import results
 from golden.results import FOLDER
 from servoscope.baseline.version_2 import GROUPS, group_flat_fields
+from servoscope.signals.quality.monitor import STATE_SIZE
 from servoscope.simulation import FaultEvent, reference, simulate
 
 # Keys of JSON whose strings have a meaning; all others are wording, which may change.
@@ -242,6 +243,8 @@ def test_a_service_goes_on_from_an_old_store_and_ends_as_it_did(tmp_path: Path) 
     found, expected = results.history(tmp_path), stored("history")
     for asset, state in expected["states"].items():
         ours, theirs = found["states"][asset].pop("numbers"), state.pop("numbers")
+        # since 2.0: data quality, whose version comes first, counts the changes of u in two numbers
+        ours = [*ours[:-STATE_SIZE], 1.0, *ours[1 - STATE_SIZE : -2]]
         # Sums near zero are among them, of which rounding elsewhere changes any number of digits.
         assert ours == theirs if SAME_MACHINE else len(ours) == len(theirs), asset
         state["document"]["judged"]["control"] = None  # kept from 1.1 on
