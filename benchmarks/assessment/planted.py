@@ -1,4 +1,4 @@
-"""Logs of a simulated servo loop with defects of the recording that are known, and without."""
+"""Logs of simulated loops: servo loops with known defects of the recording, and valves that stick or do not."""
 
 from __future__ import annotations
 
@@ -73,3 +73,38 @@ def logs(number: int, seed: int) -> Iterator[tuple[str, Samples]]:
     for defect in DEFECTS:
         for k in range(number):
             yield defect, spoil(defect, r[k], u[k], y[k], rng)
+
+
+def valve_logs(number: int, noise: float, seed: int) -> Iterator[tuple[bool, Samples]]:
+    """Yield whether the valve sticks, and samples of process loops under PI control, `number` of each.
+
+    A valve sticks by 1 to 5 % of the range of u (two parameters: Choudhury, Thornhill and Shah, Control Eng. Practice
+    13, 2005, 641); noise: its standard deviation as a share of half of that. The others have a load that swings.
+    """
+    for k in range(2 * number):
+        yield k % 2 == 0, _valve_log(k % 2 == 0, noise, np.random.default_rng([seed, k]))
+
+
+def _valve_log(sticks: bool, noise: float, rng: np.random.Generator) -> Samples:
+    rows, dead, lag = 1500, int(rng.integers(1, 6)), rng.uniform(5.0, 30.0)
+    speed = 1.0 / lag
+    gain, reset = lag / (dead + rng.uniform(1.0, 2.5) * max(dead, lag / 4.0)), lag
+    integrates = bool(rng.random() < 0.25)
+    if integrates:
+        speed, gain, reset = 0.05, 20.0 / (3.0 * max(dead, 3)), 12.0 * max(dead, 3)
+    band = rng.uniform(1.0, 5.0)
+    jump = band * rng.uniform(0.3, 1.0)
+    swing, period = rng.uniform(0.5, 1.5), rng.uniform(40.0, 200.0)
+    drift, white = rng.standard_normal((2, rows))
+    u, y, stem, level, total, load = np.zeros(rows), np.zeros(rows), np.zeros(rows), 0.0, 0.0, 0.0
+    for k in range(rows):
+        y[k] = level + noise * (0.5 * band if sticks else 1.0) * white[k]
+        total -= gain * y[k] / reset
+        u[k] = total - gain * y[k]
+        stem[k] = stem[k - 1] if sticks else u[k]
+        if abs(u[k] - stem[k]) > 0.5 * (band + jump):
+            stem[k] = u[k] - np.sign(u[k] - stem[k]) * 0.5 * (band - jump)
+        load = 0.97 * load + 0.05 * drift[k]
+        flow = stem[max(k - dead, 0)] + load + (0.0 if sticks else swing * np.sin(2.0 * np.pi * k / period))
+        level += speed * (flow if integrates else flow - level)
+    return Samples.from_columns(10.0 * np.arange(rows), np.full(rows, 50.0), 50.0 + u, 50.0 + y)

@@ -1,4 +1,4 @@
-"""How often `servoscope assess` is right: process loops, healthy servo recordings, grids and planted defects.
+"""How often `servoscope assess` is right: measured loops, grids, planted defects, simulated valves.
 
     python benchmarks assessment/score [--data ../shared/data] [--number 200] [--every 1]
 
@@ -14,12 +14,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from assessment.planted import DEFECTS, logs
+from assessment.planted import DEFECTS, logs, valve_logs
 from assessment.records import process_logs, servo_logs
 from tables import Table, parse_with_data, parser, show
 
 from servoscope.assessment.assess import MIN_RESTING, MIN_ROWS, Assessment, assess
-from servoscope.assessment.facts import find_quantum, noise_of
+from servoscope.signals.quantisation import find_quantum, white_noise_std
 from servoscope.signals.samples import Samples
 
 THRESHOLDS = np.arange(8.0, 60.0)
@@ -44,6 +44,11 @@ def called(logs: Sequence[Assessment], threshold: float) -> bool:
     return float(np.mean([log.value("y rests while u moves on") > threshold for log in logs])) >= 0.5
 
 
+def shows_signs(log: Assessment) -> bool:
+    """Return what two textbook indices say: Horch above 2/3, or He and others above 0.6."""
+    return log.value("odd cross-correlation") > 2.0 / 3.0 or log.value("triangular half cycles of u") > 0.6
+
+
 def choose_threshold(loops: Loops) -> float:
     """Return the middle of the thresholds that are right in most loops."""
     right = [sum(called(logs, x) == sticks for (sticks, _), logs in loops.items()) for x in THRESHOLDS]
@@ -61,13 +66,31 @@ def loop_table(loops: Loops) -> Table:
         ]
         shipped = [called(loops[key], MIN_RESTING) for key in of]
         single = [log.verdict == "stiction" for key in of for log in loops[key]]
-        rows.append((label, str(len(of)), str(sum(left_out)), str(sum(shipped)), f"{sum(single)} of {len(single)}"))
+        simple = [float(np.mean([shows_signs(log) for log in loops[key]])) >= 0.5 for key in of]
+        counts = (len(of), sum(left_out), sum(shipped), sum(simple))
+        rows.append((label, *map(str, counts), f"{sum(single)} of {len(single)}"))
     return Table(
         "Process loops",
         "A loop is judged to stick where half of its logs are.",
-        ("label", "loops", "judged to stick, one left out", "as shipped", "logs, as shipped"),
+        ("label", "loops", "judged to stick, one left out", "as shipped", "two textbook indices", "logs, as shipped"),
         tuple(rows),
     )
+
+
+def valve_table(number: int) -> Table:
+    """Return how simulated loops are judged under noise."""
+    rows = []
+    for noise in (0.05, 0.2, 0.5):
+        count = Counter[tuple[bool, str]]()
+        for sticks, samples in valve_logs(number, noise, SEED):
+            log = assess(samples)
+            count[sticks, "rule"] += log.verdict == "stiction"
+            count[sticks, "signs"] += shows_signs(log)
+        judged = (str(count[sticks, by]) for by in ("rule", "signs") for sticks in (True, False))
+        rows.append((f"{noise:g}", str(number), *judged))
+    columns = ("noise", "valves of each kind", "rule, sticks", "rule, others", "indices, sticks", "indices, others")
+    note = "Noise of y as a share of half the stiction; the loads of the others swing."
+    return Table("Simulated valves", note, columns, tuple(rows))
 
 
 def rested(log: Samples, seconds: float, rng: np.random.Generator) -> Samples:
@@ -75,7 +98,7 @@ def rested(log: Samples, seconds: float, rng: np.random.Generator) -> Samples:
     valid = log[np.isfinite(log.t) & np.isfinite(log.u) & np.isfinite(log.y)]
     step = float(np.median(np.diff(valid.t)))
     rows = int(seconds / step)
-    u, y = (np.r_[x, x[-1] + noise_of(x) * rng.standard_normal(rows)] for x in (valid.u, valid.y))
+    u, y = (np.r_[x, x[-1] + white_noise_std(x) * rng.standard_normal(rows)] for x in (valid.u, valid.y))
     known = not np.array_equal(valid.r, valid.u, equal_nan=True)
     t = np.r_[valid.t, valid.t[-1] + step * np.arange(1, rows + 1)]
     return Samples.from_columns(t, np.r_[valid.r, np.full(rows, valid.r[-1])] if known else u, u, y)
@@ -187,5 +210,6 @@ def main() -> None:
         servo_table(given.data / "real", given.every),
         grid_table(given.number),
         planted_table(given.number),
+        valve_table(max(given.number // 8, 1)),
     )
     show(tables, given.json, {"10 000 rows": f"{seconds(10_000):.1f}", "1 000 000 rows": f"{seconds(1_000_000):.1f}"})

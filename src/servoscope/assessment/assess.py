@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, PrivateAttr
 
-from servoscope.assessment.behaviour import AXIS_FACTS, LOOP_FACTS
-from servoscope.assessment.facts import RECORDING_FACTS, LoopFact
+from servoscope.assessment import behaviour, facts
+from servoscope.assessment.facts import LoopFact
 from servoscope.assessment.log import LogForms, Signals
 from servoscope.core.errors import RecordingError
 from servoscope.core.messages import Message, MessageText, message
@@ -26,11 +25,28 @@ DOUBTS: tuple[Verdict, ...] = ("stiction", "frozen sensor", "manual", "saturatio
 MIN_ROWS = 100
 MAX_MISSING_SHARE = 0.3
 MAX_PROCESS_RATE_HZ = 1.0  # up to which a log is taken for one of a valve
-MIN_DOUBT = {"frozen y": 10.0, "u does not react": 10.0, "u at its upper limit": 20.0, "u at its lower limit": 20.0}
 # y rests over this much of the travel of u [%]; `benchmarks/assessment/score.py` counts what such a rule finds in
-# process loops that it was not chosen for: 5 of 7 that stick, and one of 27 others
+# process loops that it was not chosen for
 MIN_RESTING = 22.0
-MEASURED_LOOPS, RIGHT_LOOPS, WRONG_ALARMS = 34, 31, 1
+MEASURED_LOOPS, RIGHT_LOOPS, WRONG_ALARMS = 34, 32, 1
+# what a verdict follows from, the first that reaches its value [%]
+RULES: tuple[tuple[str, float, Verdict], ...] = (
+    ("y rests while u moves on", MIN_RESTING, "stiction"),
+    ("frozen y", 10.0, "frozen sensor"),
+    ("u does not react", 10.0, "manual"),
+    ("u at its upper limit", 20.0, "saturation"),
+    ("u at its lower limit", 20.0, "saturation"),
+)
+DECIDING = (facts.frozen, facts.saturated, facts.manual, behaviour.sticking)
+DESCRIBING = (
+    facts.rest,
+    facts.quantum,
+    facts.straight,
+    behaviour.oscillation,
+    behaviour.tracking,
+    behaviour.gain_margin,
+    behaviour.valve_signs,
+)
 
 
 class Assessment(ShortRepr, BaseModel):
@@ -116,17 +132,8 @@ def assess(log: Samples | Source, *, name: str | None = None, kind: Kind | None 
     forms = LogForms.from_samples(log, name)
     rate = 1.0 / max(forms.recorded.step, 1e-300)
     kind = kind or ("valve" if rate <= MAX_PROCESS_RATE_HZ else "axis")
-    facts: tuple[LoopFact, ...] = ()
-    verdict: Verdict = "cannot tell"
-    if forms.missing > MAX_MISSING_SHARE:
-        reason = message("assess.missing", share=forms.missing)
-    elif forms.even.t.size < MIN_ROWS:
-        key = "assess.rest" if forms.rest.any() else "assess.short"
-        reason = message(key, samples=forms.even.t.size, least=MIN_ROWS)
-    else:
-        measures = RECORDING_FACTS + LOOP_FACTS + (AXIS_FACTS if kind != "valve" else ())
-        facts = tuple(fact for measure in measures for fact in measure(forms))
-        verdict, reason = judge(facts)
+    of_axes = () if kind == "valve" else (behaviour.friction, behaviour.dead_band)
+    verdict, reason, found = measure(forms, (*DESCRIBING, *DECIDING, *of_axes))
     key = verdict.replace(" ", "_") + (f"_{kind}" if verdict == "stiction" else "")
     assessment = Assessment(
         recording=name,
@@ -136,22 +143,36 @@ def assess(log: Samples | Source, *, name: str | None = None, kind: Kind | None 
         advice=message(f"assess.advice_{key}"),
         samples=len(log),
         sample_rate_hz=rate,
-        facts=facts,
+        facts=found,
     )
     assessment._signals = forms.recorded
     return assessment
 
 
-def judge(facts: tuple[LoopFact, ...]) -> tuple[Verdict, Message]:
-    """Return the verdict of some facts and its reason."""
-    share = next((fact.value for fact in facts if fact.name == "y rests while u moves on"), 0.0)
-    if share > MIN_RESTING:
-        score = {"loops": MEASURED_LOOPS, "right": RIGHT_LOOPS, "wrong": WRONG_ALARMS}
-        return "stiction", message("assess.reason_stiction", share=share / 100.0, **score)
-    high = [fact for fact in facts if fact.value >= MIN_DOUBT.get(fact.name, np.inf)]
-    if not high:
-        return "nothing conspicuous", message("assess.reason_nothing_conspicuous")
-    first = high[0]
-    verdicts: dict[str, Verdict] = {"frozen y": "frozen sensor", "u does not react": "manual"}
-    verdict = verdicts.get(first.name, "saturation")
-    return verdict, message(f"assess.reason_{verdict.replace(' ', '_')}", share=first.value / 100.0)
+def judge(log: Samples, name: str = "log") -> tuple[Verdict, Message]:
+    """Return the verdict of `assess` and its reason, from the facts alone that decide it.
+
+    Raises RecordingError if the samples hold no values, or no time.
+    """
+    return measure(LogForms.from_samples(log, name), DECIDING)[:2]
+
+
+def measure(
+    log: LogForms, measures: Sequence[Callable[[LogForms], Iterable[LoopFact]]]
+) -> tuple[Verdict, Message, tuple[LoopFact, ...]]:
+    """Return what some facts of a log decide, the reason, and the facts."""
+    if log.missing > MAX_MISSING_SHARE:
+        return "cannot tell", message("assess.missing", share=log.missing), ()
+    if (rows := log.even.t.size) < MIN_ROWS:
+        return (
+            "cannot tell",
+            message("assess.rest" if log.rest.any() else "assess.short", samples=rows, least=MIN_ROWS),
+            (),
+        )
+    found = tuple(fact for each in measures for fact in each(log))
+    values = {fact.name: fact.value for fact in found}
+    for name, least, verdict in RULES:
+        if (value := values.get(name, 0.0)) >= least:
+            score = {"loops": MEASURED_LOOPS, "right": RIGHT_LOOPS, "wrong": WRONG_ALARMS}
+            return verdict, message(f"assess.reason_{verdict.replace(' ', '_')}", share=value / 100.0, **score), found
+    return "nothing conspicuous", message("assess.reason_nothing_conspicuous"), found

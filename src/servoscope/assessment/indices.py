@@ -6,17 +6,16 @@ All take equidistant samples without gaps, shape (N,), and a period in samples.
 from __future__ import annotations
 
 import itertools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import signal
 
 from servoscope.core.arrays import FloatArray
 
 MIN_CYCLES = 2.5  # of an oscillation in a record
-MIN_CROSSINGS = 4  # of the autocorrelation, for a regularity
-MAX_INTERVALS = 10  # between zero crossings of the autocorrelation, as in the paper
+MIN_CROSSINGS, MAX_INTERVALS = 4, 10  # zero crossings of the autocorrelation, and what lies between them
+MIN_REGULARITY = 1.0
 POINTS = 32  # of a half cycle after resampling
 
 
@@ -24,56 +23,38 @@ class Oscillation(NamedTuple):
     """The strongest oscillation of a signal."""
 
     period: float  # [samples]
-    regularity: float  # r; above 1 the oscillation is regular
+    regularity: float  # r, above 1
     share: float  # of the signal's variance in the band of the oscillation
-    band: FloatArray  # the signal in that band, shape (N,)
 
 
 def find_oscillation(x: FloatArray) -> Oscillation | None:
-    """Return the strongest oscillation, or None where nothing moves.
+    """Return the strongest oscillation where it is regular.
 
     r = mean(T_i) / (3 std(T_i)), T_i: intervals between zero crossings of the autocorrelation of the signal within an
     octave around the peak of its spectrum (Thornhill, Huang and Zhang, J. Process Control 13, 2003, 91-100). Known
     failure: two oscillations of like strength make each other irregular.
     """
-    if not np.ptp(x) > 1e-9 * np.abs(x).max():
+    f, power = signal.periodogram(signal.detrend(x), window="hann")
+    smooth = np.convolve(np.where(f < MIN_CYCLES / x.size, 0.0, power), [0.25, 0.5, 0.25], "same")
+    peak = float(f[np.argmax(smooth)])
+    if not np.ptp(x) > 1e-9 * np.abs(x).max() or not peak > 0.0:
         return None
-    x = signal.detrend(np.asarray(x, dtype=np.float64))
-    n = x.size
-    spectrum = np.fft.rfft(x * np.hanning(n))
-    frequency = np.fft.rfftfreq(n)
-    power = np.abs(spectrum) ** 2
-    power[frequency < MIN_CYCLES / n] = 0.0
-    smooth = np.convolve(power, [0.25, 0.5, 0.25], "same")
-    if not smooth.max() > 0.0:
+    band, faster = band_pass(x, 0.5 * peak, 2.0 * peak), band_pass(x, peak / 3.0, 1.0)  # without what is slower
+    rho = signal.correlate(band, band)[x.size - 1 :][: x.size // 2]
+    before = np.flatnonzero(rho[:-1] * rho[1:] < 0.0)[: MAX_INTERVALS + 1]
+    intervals = np.diff(before + rho[before] / (rho[before] - rho[before + 1]))
+    if before.size < MIN_CROSSINGS:
         return None
-    peak = frequency[int(np.argmax(smooth))]
-    whole = np.fft.rfft(x)
-    band = _octave(whole, frequency / peak, n)
-    padded = np.fft.rfft(band, 2 * n)
-    rho = np.fft.irfft(np.abs(padded) ** 2)[: n // 2]
-    crossings = np.flatnonzero(rho[:-1] * rho[1:] < 0.0)[: MAX_INTERVALS + 1]
-    faster = x - np.fft.irfft(np.where(frequency < peak / 3.0, whole, 0.0), n)  # without what is slower
-    share = min(float(band.var() / max(faster.var(), 1e-300)), 1.0)
-    if crossings.size < MIN_CROSSINGS:
-        return Oscillation(1.0 / float(peak), 0.0, share, band)
-    at = crossings + rho[crossings] / (rho[crossings] - rho[crossings + 1])
-    intervals = np.diff(at)
-    regularity = float(intervals.mean() / (3.0 * max(float(intervals.std()), 0.01 * float(intervals.mean()))))
-    return Oscillation(2.0 * float(intervals.mean()), regularity, share, band)
+    mean = float(intervals.mean())
+    regularity = mean / (3.0 * max(float(intervals.std()), 0.01 * mean))
+    found = Oscillation(2.0 * mean, regularity, min(float(band.var() / max(faster.var(), 1e-300)), 1.0))
+    return found if regularity > MIN_REGULARITY else None
 
 
-def _octave(spectrum: npt.NDArray[np.complex128], relative: npt.NDArray[np.floating[Any]], samples: int) -> FloatArray:
-    """Return what a spectrum holds within an octave around its relative frequency 1, as a signal."""
-    return np.asarray(np.fft.irfft(np.where((relative > 0.5) & (relative < 2.0), spectrum, 0.0), samples))
-
-
-def smooth_to(x: FloatArray, period: float, harmonics: float = 7.0) -> FloatArray:
-    """Return a signal without what is slower than a third of the oscillation, or faster than its 7th harmonic."""
-    spectrum = np.fft.rfft(signal.detrend(x))
-    frequency = np.fft.rfftfreq(x.size) * period
-    spectrum[(frequency < 1.0 / 3.0) | (frequency > harmonics)] = 0.0
-    return np.asarray(np.fft.irfft(spectrum, x.size))
+def band_pass(x: FloatArray, low: float, high: float) -> FloatArray:
+    """Return what a signal holds between two frequencies [1 / samples], its line through the ends of the log apart."""
+    f, spectrum = np.fft.rfftfreq(x.size), np.fft.rfft(signal.detrend(x))
+    return np.asarray(np.fft.irfft(np.where((f > low) & (f < high), spectrum, 0.0), x.size))
 
 
 def half_cycles(x: FloatArray, period: float) -> FloatArray:
@@ -88,34 +69,23 @@ def half_cycles(x: FloatArray, period: float) -> FloatArray:
     return np.array(cycles).reshape(-1, POINTS)
 
 
-def _left_over(cycles: FloatArray, shapes: FloatArray) -> FloatArray:
-    """Return what the best of some shapes leaves of each half cycle's square sum, shape (M,)."""
-    unit = shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
-    return np.asarray(np.square(cycles).sum(axis=1) - np.square((cycles @ unit.T).max(axis=1).clip(0.0)))
-
-
-def shape_index(x: FloatArray, period: float) -> tuple[float, float]:
-    """Return how triangular, and how rectangular, the half cycles are: E_sine / (E_sine + E_shape); 0.5: undecided.
+def shape_index(x: FloatArray, period: float) -> float:
+    """Return how triangular the half cycles are: E_sine / (E_sine + E_triangle); 0.5: undecided.
 
     The mean squared errors of a sine and of a triangle with free peak, fitted to each half cycle (He, Wang, Pottmann
     and Qin, Ind. Eng. Chem. Res. 46, 2007, 4549-4560): triangles in u of a self-regulating loop, or in y of an
-    integrating one, are a sign of stiction. The trapezoid for y is the same idea. Known failure: noise in the place of
-    an oscillation, and set-point changes.
+    integrating one, are a sign of stiction. Known failure: noise in the place of an oscillation, and set-point changes.
     """
-    cycles = half_cycles(smooth_to(x, period), period)
+    cycles = half_cycles(x, period)
     if len(cycles) < 3:
-        return 0.5, 0.5
-    at = np.arange(1, POINTS + 1) / (POINTS + 1.0)
-    sine = np.sin(np.pi * at)[None, :]
-    peaks = np.linspace(0.15, 0.85, 15)[:, None]
-    triangles = np.where(at < peaks, at / peaks, (1.0 - at) / (1.0 - peaks))
-    edges = np.array([0.02, 0.08, 0.15, 0.25])[:, None]
-    trapezoids = np.clip(np.minimum(at / edges, (1.0 - at) / edges), 0.0, 1.0)
-    scale = np.square(cycles).sum(axis=1).clip(1e-300)
-    of_sine, of_triangle, of_trapezoid = (
-        float(np.median(_left_over(cycles, shapes) / scale)) for shapes in (sine, triangles, trapezoids)
-    )
-    return of_sine / (of_sine + of_triangle + 1e-12), of_sine / (of_sine + of_trapezoid + 1e-12)
+        return 0.5
+    at, peaks = np.arange(1, POINTS + 1) / (POINTS + 1.0), np.linspace(0.15, 0.85, 15)[:, None]
+    cycles /= np.linalg.norm(cycles, axis=1, keepdims=True)
+    left = []
+    for shapes in (np.sin(np.pi * at)[None], np.where(at < peaks, at / peaks, (1.0 - at) / (1.0 - peaks))):
+        fitted = cycles @ (shapes / np.linalg.norm(shapes, axis=1, keepdims=True)).T
+        left.append(float(np.median(1.0 - np.square(fitted.max(axis=1).clip(0.0)))))
+    return left[0] / max(sum(left), 1e-12)
 
 
 def cross_correlation_index(u: FloatArray, y: FloatArray) -> float:
@@ -125,15 +95,12 @@ def cross_correlation_index(u: FloatArray, y: FloatArray) -> float:
     function (Horch, Control Engineering Practice 7, 1999, 1221-1231). Known failure: integrating processes, and PI
     control with strong integral action.
     """
-    n = u.size
-    c = np.fft.irfft(np.fft.rfft(u, 2 * n) * np.conj(np.fft.rfft(y, 2 * n)))
-    c = np.r_[c[-(n // 2) :], c[: n // 2]]
-    middle, crossings = n // 2, np.flatnonzero(c[:-1] * c[1:] <= 0.0)
-    right, left = crossings[crossings >= middle], crossings[crossings < middle]
-    if not right.size or not left.size:
+    c = signal.correlate(u, y)
+    lags = np.flatnonzero(c[:-1] * c[1:] <= 0.0) - u.size + 1
+    after, before = lags[lags >= 0], lags[lags < 0]
+    if not after.size or not before.size:
         return 0.0
-    after, before = right[0] + 1 - middle, middle - left[-1]
-    return float(abs(after - before) / (after + before))
+    return float(abs(after[0] + 1 + before[-1]) / (after[0] + 1 - before[-1]))
 
 
 def ellipse_width(u: FloatArray, y: FloatArray, period: float) -> float:
@@ -143,7 +110,6 @@ def ellipse_width(u: FloatArray, y: FloatArray, period: float) -> float:
     and Shook, Control Engineering Practice 14, 2006, 1395-1412). Known failure: dead time and lag widen the ellipse,
     so it is meaningful only once stiction has been found.
     """
-    wave = np.exp(-2j * np.pi * np.arange(u.size) / period) * np.hanning(u.size)
-    gain = 2.0 / np.hanning(u.size).sum()
-    of_u, of_y = gain * (wave @ u), gain * (wave @ y)
-    return float(2.0 * abs(of_u) * abs(np.sin(np.angle(of_u * np.conj(of_y)))))
+    window = np.hanning(u.size)
+    wave = 2.0 / window.sum() * window * np.exp(-2j * np.pi * np.arange(u.size) / period)
+    return float(2.0 * abs(wave @ u) * abs(np.sin(np.angle((wave @ u) * np.conj(wave @ y)))))

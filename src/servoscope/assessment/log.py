@@ -2,70 +2,57 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from servoscope.assessment.indices import Oscillation, find_oscillation
 from servoscope.core.arrays import BoolArray, FloatArray, IntArray
 from servoscope.core.errors import RecordingError
+from servoscope.signals.quantisation import find_quantum
 from servoscope.signals.samples import Samples
 
 MAX_FILLED_GAP = 3  # samples that are interpolated; at a longer gap the log is cut
 MAX_ROWS = 200_000  # of the even stretch; of a longer one, means of neighbours
-REST_BLOCKS = 200  # of a log, in which rest is looked for
+REST_BLOCKS, MIN_REST_BLOCKS = 200, 20  # of a log, and how many in a row are rest
 MAX_REST_RANGE = 0.02  # of the range of a signal in the log
-MIN_REGULARITY = 1.0  # of an oscillation, after Thornhill et al.
-MIN_REST_SHARE = 0.1  # of the log, in one stretch
 
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """Samples of a log, whose reference may be unknown."""
+    """Columns of a log."""
 
-    samples: Samples
-    known: bool  # whether r is
+    t: FloatArray  # [s]
+    r: FloatArray | None  # None: unknown
+    u: FloatArray
+    y: FloatArray
 
-    @property
-    def t(self) -> FloatArray:
-        """The time [s]."""
-        return self.samples.t
-
-    @property
-    def r(self) -> FloatArray | None:
-        """The reference; None where it is unknown."""
-        return self.samples.r if self.known else None
-
-    @property
-    def u(self) -> FloatArray:
-        """The control input."""
-        return self.samples.u
-
-    @property
-    def y(self) -> FloatArray:
-        """The measured output."""
-        return self.samples.y
-
-    @property
+    @cached_property
     def step(self) -> float:
         """The sample period [s]."""
         return float(self.t[-1] - self.t[0]) / max(self.t.size - 1, 1)
 
-    @property
+    @cached_property
     def e(self) -> FloatArray:
         """The control error; of an unknown reference, the mean of y is taken."""
-        return (self.r if self.r is not None else float(self.y.mean())) - self.y
+        return (float(self.y.mean()) if self.r is None else self.r) - self.y
 
     @cached_property
     def cycle(self) -> Oscillation | None:
-        """The oscillation of the error where it is regular."""
-        strongest = find_oscillation(self.e)
-        return strongest if strongest is not None and strongest.regularity > MIN_REGULARITY else None
+        """The regular oscillation of the error."""
+        return find_oscillation(self.e)
+
+    @cached_property
+    def quantum(self) -> dict[str, float | None]:
+        """The step of the grid of y and of u, None where there is none."""
+        return {"y": find_quantum(self.y), "u": find_quantum(self.u)}
 
     def rows(self, chosen: BoolArray | slice) -> Signals:
         """Return some of the rows."""
-        return Signals(self.samples[chosen], self.known)
+        return Signals(self.t[chosen], None if self.r is None else self.r[chosen], self.u[chosen], self.y[chosen])
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,40 +68,33 @@ class LogForms:
     @classmethod
     def from_samples(cls, samples: Samples, name: str) -> LogForms:
         """Return the log of some samples. Raises RecordingError if they hold no values, or no time."""
-        known = not (np.array_equal(samples.r, samples.u, equal_nan=True) or np.isnan(samples.r).all())
-        valid = np.isfinite(samples.t) & np.isfinite(samples.u) & np.isfinite(samples.y)
-        if known:
-            valid &= np.isfinite(samples.r)
+        t, r, u, y = (np.asarray(x, dtype=np.float64) for x in (samples.t, samples.r, samples.u, samples.y))
+        known = not (np.array_equal(r, u, equal_nan=True) or np.isnan(r).all())
+        valid = np.isfinite(t + u + y + (r if known else 0.0))
         if valid.sum() < 2:
             raise RecordingError(f"{name}: u and y hold no numbers in the same rows, choose other columns")
-        recorded = Signals(samples, known).rows(valid)
-        steps = np.diff(recorded.t)
-        if not (steps > 0.0).any():
+        recorded = Signals(t, r if known else None, u, y).rows(valid)
+        if not (np.diff(recorded.t) > 0.0).any():
             raise RecordingError(f"{name}: the time does not advance, choose another time column")
         resting = find_rest(recorded)
-        runs = (np.cumsum(samples.restart)[valid] + np.cumsum(np.r_[0, np.diff(resting.astype(int)) != 0]))[~resting]
+        runs = np.cumsum(samples.restart)[valid] + np.cumsum(np.diff(resting, prepend=False))
         moving = recorded.rows(~resting)
-        return cls(recorded, resting, moving, form_even(moving, runs), 1.0 - float(valid.mean()))
+        return cls(recorded, resting, moving, form_even(moving, runs[~resting]), 1.0 - float(valid.mean()))
 
 
 def find_rest(log: Signals) -> BoolArray:
     """Return the rows, shape (N,), of long stretches in which r, u and y all keep to a small part of their range."""
     size = max(log.t.size // REST_BLOCKS, 1)
     starts = np.arange(0, log.t.size, size)
-    known = [x for x in (log.r, log.u, log.y) if x is not None]
-    resting = np.zeros(log.t.size, np.bool_)
-    if not (np.ptp(log.u) > 0.0 and np.ptp(log.y) > 0.0):
-        return resting  # what never changes does not rest
-    spans = np.array([np.ptp(x) for x in known]) * MAX_REST_RANGE
-    low = np.array([np.minimum.reduceat(x, starts) for x in known])
-    high = np.array([np.maximum.reduceat(x, starts) for x in known])
-    least, first = MIN_REST_SHARE * starts.size, 0
-    for k in range(starts.size):  # the widest window up to block k in which all keep still
-        while first <= k and np.any(high[:, first : k + 1].max(axis=1) - low[:, first : k + 1].min(axis=1) > spans):
-            first += 1
-        if k + 1 - first >= least:
-            resting[first * size : (k + 1) * size] = True
-    return resting
+    if starts.size < MIN_REST_BLOCKS or not (np.ptp(log.u) > 0.0 and np.ptp(log.y) > 0.0):
+        return np.zeros(log.t.size, np.bool_)  # what never changes does not rest
+    still = np.ones(starts.size - MIN_REST_BLOCKS + 1, np.bool_)
+    for x in (log.u, log.y) if log.r is None else (log.r, log.u, log.y):
+        tops = (np.maximum.reduceat(sign * x, starts) for sign in (1.0, -1.0))
+        span = sum(sliding_window_view(top, MIN_REST_BLOCKS).max(axis=1) for top in tops)
+        still &= span <= MAX_REST_RANGE * np.ptp(x)
+    blocks = np.convolve(still, np.ones(MIN_REST_BLOCKS)) > 0.0
+    return np.asarray(np.repeat(blocks, size)[: log.t.size])
 
 
 def form_even(log: Signals, runs: IntArray) -> Signals:
@@ -123,14 +103,15 @@ def form_even(log: Signals, runs: IntArray) -> Signals:
     if not (steps > 0.0).any():
         return log
     period = float(np.median(steps[steps > 0.0]))
-    breaks = np.flatnonzero((steps > (MAX_FILLED_GAP + 1.5) * period) | (steps <= 0.0) | (np.diff(runs) != 0)) + 1
-    edges = np.r_[0, breaks, log.t.size]
-    longest = int(np.argmax(np.diff(edges)))
-    part = log.rows(slice(edges[longest], edges[longest + 1]))
+    # a row may repeat the time of the one before it, as clocks that are rounded write it
+    breaks = np.flatnonzero((steps > (MAX_FILLED_GAP + 1.5) * period) | (steps < 0.0) | (np.diff(runs) != 0)) + 1
+    first, stop = max(itertools.pairwise([0, *breaks.tolist(), log.t.size]), key=lambda edges: edges[1] - edges[0])
+    part = log.rows(slice(first, stop))
     even = np.arange(part.t[0], part.t[-1] + 0.5 * period, period)
     factor = -(-even.size // MAX_ROWS)
-    t, r, u, y = (thin(np.interp(even, part.t, x), factor) for x in (part.t, part.samples.r, part.u, part.y))
-    return Signals(Samples.from_columns(t, r, u, y), log.known)
+    r = part.y if part.r is None else part.r
+    t, r, u, y = (thin(np.interp(even, part.t, x), factor) for x in (part.t, r, part.u, part.y))
+    return Signals(t, None if part.r is None else r, u, y)
 
 
 def thin(x: FloatArray, factor: int) -> FloatArray:

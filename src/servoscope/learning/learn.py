@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from servoscope.assessment.assess import DOUBTS, assess
+from servoscope.assessment.assess import DOUBTS, judge
 from servoscope.baseline.axis_model import AxisModel, AxisMoves
 from servoscope.baseline.baseline import Baseline
 from servoscope.baseline.records import BaselineSource, ExactPredictorFit, HealthyScatter, digest
@@ -48,10 +48,8 @@ Progress = Callable[[str], None]
 
 def doubt_healthy(recording: Recording) -> Message | None:
     """Return what a recording shows by itself that forbids learning from it, if it does."""
-    assessment = assess(recording)
-    if assessment.verdict not in DOUBTS:
-        return None
-    return message("learning.doubt", recording=recording.name, reason=assessment.reason)
+    verdict, reason = judge(recording, recording.name)
+    return message("learning.doubt", recording=recording.name, reason=reason) if verdict in DOUBTS else None
 
 
 @with_one_blas_thread

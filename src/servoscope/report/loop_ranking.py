@@ -23,7 +23,8 @@ def rank(assessments: Iterable[Assessment]) -> list[Assessment]:
 def group_by_period(assessments: Sequence[Assessment]) -> list[tuple[Assessment, ...]]:
     """Return the loops that share a period, the likeliest source first; groups of two and more, the largest first.
 
-    The source is the loop that sticks or is at a limit, and of equals the one whose y rests longest while u moves on.
+    The source is the loop that sticks or is at a limit, and of equals the one that oscillates most regularly: what the
+    loops on the way hand on is blurred (Thornhill and Horch, Control Eng. Practice 15, 2007, 1306-1319).
     """
     groups: list[list[Assessment]] = []
     for a in sorted((a for a in assessments if a.value("oscillation")), key=lambda a: a.value("oscillation")):
@@ -37,4 +38,5 @@ def group_by_period(assessments: Sequence[Assessment]) -> list[tuple[Assessment,
 
 
 def _source_rank(a: Assessment) -> tuple[bool, float]:
-    return a.verdict in DOUBTS, a.value("y rests while u moves on")
+    regularity = next(fact.evidence.get("regularity", 0.0) for fact in a.facts if fact.name == "oscillation")
+    return a.verdict in ("stiction", "saturation"), regularity

@@ -10,6 +10,7 @@ from servoscope.learning.inspection import excitation, model_order, signals
 from servoscope.learning.inspection.excitation import Spectra, information_edge, windowed_segments
 from servoscope.learning.inspection.model_order import Regressors
 from servoscope.signals import Recording
+from servoscope.signals.quantisation import find_quantum, white_noise_std
 
 MIN_FITTED_SHARE = 0.5  # of the power of u at a frequency, that the fit explains: as much as it leaves
 BAND_RATIO = 2.0 ** (1.0 / 6.0)  # of the cutoff: what the filter damps but little lies beyond it, too
@@ -18,8 +19,7 @@ SAMPLES_PER_CUTOFF = 10.0  # samples per period of the cutoff at least
 
 def measure_cutoff(recording: Recording, is_speed: bool) -> float:
     """Return the cutoff [Hz] that a recording asks for, as `inspect` suggests it."""
-    step = signals.quantisation("y", recording.y).step
-    noise = signals.white_noise_std(recording.y, recording.restart, step)
+    noise = white_noise_std(recording.y, recording.restart, find_quantum(recording.y))
     return suggest_cutoff(recording, excitation.spectra(recording, reference_period(recording)), noise, is_speed)
 
 

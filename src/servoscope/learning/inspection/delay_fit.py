@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from servoscope.core.arrays import BoolArray, FloatArray
+from servoscope.core.arrays import FloatArray
 from servoscope.estimation.noise_model import WhiteNoise, largest_autocorrelation
 from servoscope.fit.plant_experiment import (
     LAGS,
@@ -26,6 +26,7 @@ from servoscope.models.loop import Loop
 from servoscope.models.lti import settling_samples
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
+from servoscope.signals.quantisation import white_noise_std
 
 # standard deviation of the logarithm of a coefficient that least squares found: noise in the regressors may have made
 # it a tenth
@@ -120,7 +121,8 @@ class DelaySearch:
         )
         names = (*(p for p in plant.parameters if p != "input_gain"), *plant.causes)
         names = tuple(name for name in names if name != "offset")
-        y_std = _white_noise_std(recording.y[head], recording.restart[head])
+        y = recording.y[head]
+        y_std = max(white_noise_std(y, recording.restart[head]), MIN_NOISE_SHARE * float(y.std()))
         noise = WhiteNoise(u_std=START_NOISE_SHARE * float(recording.u[head].std()), y_std=y_std)
         prior = np.full(len(names), spread)
         recorded = PlantExperiment.from_recordings(loop, [recording], plant, names, prior, noise, latest)
@@ -178,10 +180,3 @@ class DelaySearch:
             return end
         whole = self._fit(np.append(end.x[:-1], round(end.x[-1])), held=True)
         return min(end, self._fit(whole.x, held=False), key=lambda fitted: fitted.cost)
-
-
-def _white_noise_std(y: FloatArray, restart: BoolArray) -> float:
-    """Return a first guess of the noise of y, from what its second differences jump by."""
-    jumps = np.diff(y, 2)[~restart[2:]]
-    guess = float(np.median(np.abs(jumps))) / (0.6745 * math.sqrt(6.0)) if jumps.size else 0.0
-    return max(guess, MIN_NOISE_SHARE * float(y.std()))

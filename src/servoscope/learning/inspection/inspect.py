@@ -36,6 +36,7 @@ from servoscope.learning.inspection.signals import InspectionModel
 from servoscope.models.loop import DEFAULT_FREQUENCIES, Loop
 from servoscope.models.lti import settling_samples
 from servoscope.signals import MIN_SAMPLES, Recording
+from servoscope.signals.quantisation import white_noise_std
 from servoscope.signals.readers import as_recording
 from servoscope.signals.readers.frames import Source
 from servoscope.signals.recording import thin_out
@@ -182,7 +183,7 @@ def _measure_with_model(
     judged = spectra if m.coherent else None
     rate = recording.sample_rate
     traces = InspectionTraces(recording, spectra, np.zeros(0), np.zeros(0, dtype=np.bool_), np.zeros(0))
-    noise = signals.white_noise_std(recording.y, recording.restart, m.quantisation[2].step)
+    noise = white_noise_std(recording.y, recording.restart, m.quantisation[2].step)
     band = excitation.usable_band(spectra) if spectra is not None else None
     derivative = 0 if loop is None else loop.plant.derivative
     suggested = suggest_cutoff(recording, spectra, noise, derivative > 0)

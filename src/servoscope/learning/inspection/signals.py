@@ -15,9 +15,8 @@ from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 from servoscope.signals.cleanup import rows_at_limits
 from servoscope.signals.defects import mask_spans, split_consecutive
+from servoscope.signals.quantisation import find_quantum
 
-MIN_STEP_SHARE = 1e-7  # share of the range below which a step is rounding of the file, not of the sensor
-ON_GRID = 0.98  # share of values that must be whole steps
 REST_SPEED_SHARE = 0.02  # share of the fast speeds (99th percentile) below which the output rests
 MIN_REST_S = 0.25  # s: turning round is not rest
 BINS = 40  # of |u|, to look for a dead zone
@@ -129,37 +128,14 @@ def quantisation(signal: Literal["r", "u", "y"], x: FloatArray) -> Quantisation:
     """Look for a grid on which the values of a signal, shape (N,), stand."""
     repeated = float(np.mean(np.diff(x) == 0.0)) if x.size > 1 else 0.0
     values = np.unique(x)
-    span = float(values[-1] - values[0])
-    step = _step(values, span) if span > 0.0 else None
+    step = find_quantum(x)
     return Quantisation(
         signal=signal,
         step=step,
-        effective_bits=math.log2(span / step) if step else None,
+        effective_bits=math.log2(float(values[-1] - values[0]) / step) if step else None,
         repeated=repeated,
         values=int(values.size),
     )
-
-
-def _step(values: FloatArray, span: float) -> float | None:
-    """Return the step of the grid that sorted values stand on, None if they do not."""
-    gaps = np.diff(values)
-    gaps = gaps[gaps > MIN_STEP_SHARE * span]
-    if gaps.size < 2:
-        return None
-    smallest = float(gaps.min())
-    # The mean over the gaps of one step is better than the smallest: files round their values.
-    step = float(gaps[gaps < 1.5 * smallest].mean())
-    far = np.abs(gaps / step - np.round(gaps / step))
-    return step if float(np.mean(far < 0.1)) >= ON_GRID else None
-
-
-def white_noise_std(x: FloatArray, restart: BoolArray, step: float | None) -> float:
-    """Return the standard deviation of what is white in x, shape (N,), robustly from third differences."""
-    third = np.diff(x, 3)
-    whole = ~(restart[1:-2] | restart[2:-1] | restart[3:])
-    third = np.abs(third[whole])
-    white = float(np.median(third)) / (0.6745 * math.sqrt(20.0)) if third.size else 0.0
-    return max(white, (step or 0.0) / math.sqrt(12.0))
 
 
 def saturation(recording: Recording, loop: Loop | None) -> Saturation:

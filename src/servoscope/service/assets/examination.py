@@ -140,15 +140,15 @@ def examine_blocks(
 
 def _assess_blocks(baseline: Baseline, name: str, blocks: Sequence[Block]) -> str | None:
     """Return what the last minutes show by themselves, "" if nothing; None where the samples do not suffice."""
-    from servoscope.assessment.assess import DOUBTS, assess
+    from servoscope.assessment.assess import DOUBTS, judge
 
     try:
-        assessment = assess(blocks_to_recording(baseline, name, blocks)[0])
+        verdict, _ = judge(blocks_to_recording(baseline, name, blocks)[0], name)
     except ServoscopeError:
         return None
-    if assessment.verdict == "cannot tell":
+    if verdict == "cannot tell":
         return None
-    return assessment.verdict if assessment.verdict in DOUBTS else ""
+    return verdict if verdict in DOUBTS else ""
 
 
 def compile_examination(baseline: Baseline) -> None:
