@@ -60,7 +60,7 @@ def test_process_loops_are_judged_as_the_sentence_says(shared_data: Path) -> Non
     from assessment.score import assess_loops, loop_table
 
     loops = assess_loops(shared_data / "real" / "process_loops")
-    (_, sticking, found, shipped, _), (_, others, wrong, shipped_wrong, _) = loop_table(loops).rows
+    (_, sticking, found, shipped, *_), (_, others, wrong, shipped_wrong, *_) = loop_table(loops).rows
     assert int(sticking) + int(others) == MEASURED_LOOPS
     assert int(found) + int(others) - int(wrong) == RIGHT_LOOPS
     assert int(wrong) == WRONG_ALARMS

@@ -133,7 +133,7 @@ def assess(log: Samples | Source, *, name: str | None = None, kind: Kind | None 
     rate = 1.0 / max(forms.recorded.step, 1e-300)
     kind = kind or ("valve" if rate <= MAX_PROCESS_RATE_HZ else "axis")
     of_axes = () if kind == "valve" else (behaviour.friction, behaviour.dead_band)
-    verdict, reason, found = measure(forms, (*DESCRIBING, *DECIDING, *of_axes))
+    verdict, reason, measured = measure(forms, (*DESCRIBING, *DECIDING, *of_axes))
     key = verdict.replace(" ", "_") + (f"_{kind}" if verdict == "stiction" else "")
     assessment = Assessment(
         recording=name,
@@ -143,7 +143,7 @@ def assess(log: Samples | Source, *, name: str | None = None, kind: Kind | None 
         advice=message(f"assess.advice_{key}"),
         samples=len(log),
         sample_rate_hz=rate,
-        facts=found,
+        facts=measured,
     )
     assessment._signals = forms.recorded
     return assessment
@@ -169,10 +169,14 @@ def measure(
             message("assess.rest" if log.rest.any() else "assess.short", samples=rows, least=MIN_ROWS),
             (),
         )
-    found = tuple(fact for each in measures for fact in each(log))
-    values = {fact.name: fact.value for fact in found}
+    measured = tuple(fact for measure_one in measures for fact in measure_one(log))
+    values = {fact.name: fact.value for fact in measured}
     for name, least, verdict in RULES:
         if (value := values.get(name, 0.0)) >= least:
             score = {"loops": MEASURED_LOOPS, "right": RIGHT_LOOPS, "wrong": WRONG_ALARMS}
-            return verdict, message(f"assess.reason_{verdict.replace(' ', '_')}", share=value / 100.0, **score), found
-    return "nothing conspicuous", message("assess.reason_nothing_conspicuous"), found
+            return (
+                verdict,
+                message(f"assess.reason_{verdict.replace(' ', '_')}", share=value / 100.0, **score),
+                measured,
+            )
+    return "nothing conspicuous", message("assess.reason_nothing_conspicuous"), measured

@@ -47,8 +47,8 @@ def find_oscillation(x: FloatArray) -> Oscillation | None:
         return None
     mean = float(intervals.mean())
     regularity = mean / (3.0 * max(float(intervals.std()), 0.01 * mean))
-    found = Oscillation(2.0 * mean, regularity, min(float(band.var() / max(faster.var(), 1e-300)), 1.0))
-    return found if regularity > MIN_REGULARITY else None
+    oscillation = Oscillation(2.0 * mean, regularity, min(float(band.var() / max(faster.var(), 1e-300)), 1.0))
+    return oscillation if regularity > MIN_REGULARITY else None
 
 
 def band_pass(x: FloatArray, low: float, high: float) -> FloatArray:
