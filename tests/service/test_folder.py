@@ -306,7 +306,7 @@ def test_a_file_that_changes_while_it_is_read_is_read_again(
 ) -> None:
     press = share()
     path = press.put("a.csv", csv(*rows(0, 50)))
-    parse, grown = log_reader.parse_file, []
+    parse, grown = log_reader.parse_files, []
 
     def grow(*arguments: Any) -> Any:
         found = parse(*arguments)
@@ -316,7 +316,7 @@ def test_a_file_that_changes_while_it_is_read_is_read_again(
             grown.append(True)
         return found
 
-    monkeypatch.setattr(log_reader, "parse_file", grow)
+    monkeypatch.setattr(log_reader, "parse_files", grow)
     press.open()
     assert press.until_rows(100) == list(range(100))
     assert all(block.shape[1] == 50 for block in press.counted["press"])

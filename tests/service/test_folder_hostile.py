@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -108,23 +109,25 @@ def test_a_name_that_is_not_utf_8_is_written_out(share: Callable[..., Share]) ->
 def test_a_slow_file_holds_up_its_own_asset_and_no_other_one(
     share: Callable[..., Share], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hall, end, parse, seen = share("press", "lift", match="{asset}_*.csv"), Event(), log_reader.parse_file, list[str]()
+    hall, end, parse, seen = share("press", "lift", match="{asset}_*"), Event(), log_reader.parse_files, list[str]()
 
-    def wait(folder: Path, file: LogFile, *arguments: Any) -> Any:
-        seen.append(file.name)
-        return (file.name != "press_0.csv" or end.wait()) and parse(folder, file, *arguments)
+    def wait(folder: Path, files: Sequence[LogFile], *arguments: Any) -> Any:
+        seen.extend(file.name for file in files)
+        return (files[0].name != "press_0.csv.gz" or end.wait()) and parse(folder, files, *arguments)
 
-    monkeypatch.setattr(log_reader, "parse_file", wait)
+    monkeypatch.setattr(log_reader, "parse_files", wait)
     monkeypatch.setattr(log_reader, "QUICK_S", 0.2)
     monkeypatch.setattr(log_reader, "FIRST_S", 0.2)
     for k in range(3):
-        hall.put(f"press_{k}.csv", csv(*rows(20 * k, 20)))
-        hall.put(f"lift_{k}.csv", csv(*rows(20 * k, 20)))
+        packed = gzip.compress(csv(*rows(20 * k, 20)).encode())
+        hall.put(f"press_{k}.csv.gz", packed)
+        hall.put(f"lift_{k}.csv" + ".gz" * (k == 2), packed if k == 2 else csv(*rows(20 * k, 20)))
     hall.open()
     assert hall.until_rows(60, "lift") == [*range(60)] and not hall.rows_of()
     end.set()
     assert hall.until_rows(60) == [*range(60)]
-    assert sorted(seen) == [f"{name}_{k}.csv" for name in ("lift", "press") for k in range(3)]  # each was read once
+    names = [*(f"lift_{k}.csv" for k in range(2)), "lift_2.csv.gz", *(f"press_{k}.csv.gz" for k in range(3))]
+    assert sorted(seen) == names  # each was read once
 
 
 def test_rows_that_the_service_refuses_as_ahead_come_again_and_blind_nobody(share: Callable[..., Share]) -> None:
@@ -140,3 +143,22 @@ def test_rows_that_the_service_refuses_as_ahead_come_again_and_blind_nobody(shar
     assert press.until_rows(150) == [*range(150)]
     press.until(lambda: (press.folder / "done/a.csv").exists())
     assert press.rejections == {"future": 2}
+
+
+def test_a_late_file_that_lay_there_at_the_start_is_told_and_one_that_was_counted_is_done(
+    share: Callable[..., Share],
+) -> None:
+    press = share(afterwards="move")
+    press.note = press.folder.with_name("in-hand")
+    press.put("a.csv", csv(*rows(100, 50)))
+    press.open()
+    press.until_rows(50)
+    press.until(lambda: (press.folder / "done/a.csv").exists())
+    press.put("b.csv", csv(*rows(150, 50)))
+    until(lambda: len(press.turn(commit=False)) == 1)
+    press.kept["press"] = press.kept["press"]._replace(sequence=1, last_t=BEGAN + 1.99)  # killed before it was moved
+    press.kill()
+    press.put("late.csv", csv(*rows(0, 50)))
+    press.open()
+    press.until(lambda: (press.folder / "failed/late.csv").exists() and (press.folder / "done/b.csv").exists())
+    assert [one.reason.partition(":")[0] for one in press.reasons] == ["late.csv"] and press.rejections == {"late": 1}

@@ -76,7 +76,7 @@ def test_a_reader_that_hangs_is_stopped_and_the_next_file_is_read(
     )  # a worker finds what is on the path when it starts
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]))
     monkeypatch.setattr(reader_process, "BASE_S", 0.5)
-    with pytest.raises(RecordingError, match=r"x\.bin: is a damaged Odd file \(it took more than 0\.5"):
+    with pytest.raises(RecordingError, match=r"x\.bin: is a damaged Odd file \(it takes more than 0\.5 s of"):
         reader_process.open_bounded(path, "Odd", "hanging", "open_it", "hanging")
     monkeypatch.setattr(reader_process, "BASE_S", 30.0)
     opened = reader_process.open_bounded(path, "CSV", "servoscope.signals.readers.csv", "open_csv", "pyarrow")

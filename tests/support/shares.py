@@ -45,6 +45,7 @@ class Share:
         self.reasons: list[Rejection] = []
         self.source: Inbox | None = None
         self.ahead_s = np.inf
+        self.note: Path | None = None  # where the source notes what must survive it
 
     def put(self, name: str, content: str | bytes, *, modified: float | None = None) -> Path:
         path = self.folder / name
@@ -57,6 +58,7 @@ class Share:
     def open(self) -> Inbox:
         assets = {name: SourceAsset(self.loop, None, self.ahead_s) for name in self.assets}
         self.source = self.settings.create("hall.share", assets, self.folder.parent)
+        self.source.state_file = self.note
         self.source.open(self.kept)
         return self.source
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 import os
 import shutil
 import signal
@@ -17,6 +18,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -108,6 +110,7 @@ class Workers:
         *arguments: Any,
         progress: Progress = lambda _: None,
         timeout_s: float | None = None,
+        cpu_s: float | None = None,
         libraries: Sequence[str] = (),
         sandbox: Sandbox | None = None,
     ) -> Any:
@@ -120,6 +123,8 @@ class Workers:
             returns what can be written as JSON.
         timeout_s
             How long it may take by the clock on the wall [s].
+        cpu_s
+            How much processor time it may take [s], in whole seconds; None: what its process may.
         libraries
             Modules that are loaded before this time counts, once for all sandboxes.
         sandbox
@@ -140,7 +145,7 @@ class Workers:
             self._busy.add(worker)
         try:
             worker.enter(libraries, sandbox)
-            return worker.exchange((function, arguments), progress, timeout_s)
+            return worker.exchange((function, arguments, cpu_s), progress, timeout_s, cpu_s)
         finally:
             with self._lock:
                 self._busy.remove(worker)
@@ -206,7 +211,13 @@ class _TaskProcess:
             self.exchange((libraries, self._limits, sandbox), timeout_s=START_S)
             self.entered = libraries, sandbox
 
-    def exchange(self, question: Any, progress: Progress = lambda _: None, timeout_s: float | None = None) -> Any:
+    def exchange(
+        self,
+        question: Any,
+        progress: Progress = lambda _: None,
+        timeout_s: float | None = None,
+        cpu_s: float | None = None,
+    ) -> Any:
         """Send a question and return the answer; raises WorkerError, see `Workers.run`."""
         late = threading.Event()
 
@@ -237,7 +248,7 @@ class _TaskProcess:
             timer.cancel()
         if late.is_set():
             raise WorkerError(f"it took more than {timeout_s:g} s, and was stopped")
-        raise WorkerError(self._cause_of_death(code if code <= SIGNAL_CODE else SIGNAL_CODE - code))
+        raise WorkerError(self._cause_of_death(code if code <= SIGNAL_CODE else SIGNAL_CODE - code, cpu_s))
 
     def _kill(self) -> None:
         with suppress(ProcessLookupError):
@@ -249,10 +260,10 @@ class _TaskProcess:
         self._kill()
         return self.process.wait()
 
-    def _cause_of_death(self, code: int) -> str:
+    def _cause_of_death(self, code: int, cpu_s: float | None) -> str:
         limits = self._limits
         if limits is not None and code == -signal.SIGXCPU:
-            return f"it takes more than {limits.cpu_s:g} s of processor time, and was stopped"
+            return f"it takes more than {round(cpu_s or limits.cpu_s, 1):g} s of processor time, and was stopped"
         need = f"; it may need more than {limits.memory_mb:g} MB of memory" if limits is not None else ""
         return f"it took its process down ({code}){need}"
 
@@ -312,11 +323,13 @@ def _run_tasks(parent: Connection, limits: ProcessLimits | None, sandbox: Sandbo
             traceback.print_exc()
             answer("error", f"it cannot be used ({type(error).__name__}: {str(error)[:200]})")
 
-    waiting: SimpleQueue[tuple[str, tuple[Any, ...]]] = SimpleQueue()
+    waiting: SimpleQueue[tuple[str, tuple[Any, ...], float | None]] = SimpleQueue()
     run(f"{__name__}:enter_bounds", limits, sandbox)  # before there is another thread: walls are around each thread
     threading.Thread(target=_read_tasks, args=(parent, waiting), daemon=True).start()
     while True:
-        name, arguments = waiting.get()
+        name, arguments, cpu_s = waiting.get()
+        if cpu_s is not None:
+            _bound_task(cpu_s)
         run(name, *arguments)
 
 
@@ -328,7 +341,16 @@ def enter_bounds(_: Progress, limits: ProcessLimits | None, sandbox: Sandbox | N
         limits.apply()
 
 
-def _read_tasks(parent: Connection, waiting: SimpleQueue[tuple[str, tuple[Any, ...]]]) -> None:
+def _bound_task(cpu_s: float) -> None:
+    """Let the kernel end this process after so much more processor time [s], until the next task has its own bound."""
+    import resource
+
+    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+    limit = math.ceil(time.process_time() + cpu_s)
+    resource.setrlimit(resource.RLIMIT_CPU, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
+
+
+def _read_tasks(parent: Connection, waiting: SimpleQueue[tuple[str, tuple[Any, ...], float | None]]) -> None:
     """Read tasks in a thread, so that the end of the parent ends a task too."""
     try:
         while task := parent.recv():

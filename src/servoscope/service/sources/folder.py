@@ -31,6 +31,7 @@ from servoscope.service.sources.log_files import (
     FileRows,
     FileVersion,
     FolderNames,
+    HandedFiles,
     IncompleteFile,
     LogFile,
     ReadFile,
@@ -119,6 +120,7 @@ class FolderTransport(ThreadTransport):
         self._share, self._names = Share(folder), FileNames(settings, list(assets))
         self._reader = LogReader(self._share, self._names, settings, self._loops, self._stop_event)
         self._resumed: dict[str, float] = {}  # by asset, up to when its rows had been counted [UTC s]
+        self._began: frozenset[str] = frozenset()  # the assets of which some had been
         # of the thread: files that may still change, those that were dealt with, and those that lay there at first;
         # contents by their digest
         self._changing: dict[str, IncompleteFile] = {}
@@ -126,6 +128,7 @@ class FolderTransport(ThreadTransport):
         self._first_names: set[str] | None = None
         self._digests: dict[bytes, str] = {}
         self._handed_rows = self._taken_rows = 0  # so far
+        self._handed, self._in_hand = HandedFiles(None), dict[str, LogFile]()
         self._trouble = render(text("service.trouble.connecting"))
         self._files_wait = True  # whether there are files that are complete, or soon will be
         # files whose rows are ahead of our clock, and until when they wait [UTC s]
@@ -135,7 +138,8 @@ class FolderTransport(ThreadTransport):
 
     def open(self, resume: Mapping[str, ResumePosition]) -> None:
         """Look into the folder from now on."""
-        self._resumed = self.settings.begin_times(self._assets, resume)
+        self._handed = HandedFiles(self.state_file if self.settings.afterwards == "move" else None)
+        self._resumed, self._began = self.settings.begin_times(self._assets, resume), frozenset(resume)
         super().open(resume)
 
     @property
@@ -195,7 +199,8 @@ class FolderTransport(ThreadTransport):
         waiting, next_look = deque[LogFile](), 0.0
         while not self._stop_event.is_set():
             try:
-                if time.monotonic() >= next_look:
+                is_crowded = len(self._unread) > MAX_COMPARED  # more were complete than were compared
+                if time.monotonic() >= next_look or (is_crowded and not waiting):
                     waiting = deque(self._look())
                     next_look = time.monotonic() + self.settings.poll_s
                 if waiting:
@@ -258,11 +263,14 @@ class FolderTransport(ThreadTransport):
         if self._first_names is None:
             self._first_names = set(changing)
         first = _take_turns(sorted(complete, key=lambda file: file.name))[:MAX_COMPARED]
+        if len(first) > 1:
+            self._reader.read_ahead(first)
         ordered = _take_turns(sorted(first, key=self._reader.order)) if len(first) > 1 else first
         self._changing, self._trouble = changing, ""
         self._early = {name: early for name, early in self._early.items() if name in changing}
         self._unread = sorted(changing[file.name].seen_since for file in complete)
         self._reader.retain(first)
+        self._handed.note([*self._in_hand.values(), *first])
         return ordered
 
     def _is_complete(self, file: LogFile, unchanged_s: float) -> bool:
@@ -313,12 +321,15 @@ class FolderTransport(ThreadTransport):
             name: asset_trouble for name, asset_trouble in self.asset_troubles.items() if name not in assets or not rows
         }
         self.asset_troubles = kept | {name: Reception("refused", why) for name, why in failures.items()}
-        is_new = file.name not in (self._first_names or ())
+        # of an asset that begins, what lay there is left out as its settings say
+        was_handed = self._began.isdisjoint(assets) or self._handed.may_be_counted(file)
+        is_new = file.name not in (self._first_names or ()) or not was_handed
         read = ReadFile(file, rows, is_new=is_new, is_failed=bool(failures))
         while self._handed_rows - self._taken_rows > MAX_HANDED_ROWS and not self._stop_event.wait(POLL_S):
             pass
         message = InboxMessage(file.name, read, time.monotonic(), partial(self._release, read))
         self._handed_rows += _count_rows(message)
+        self._in_hand[file.name] = file
         self.waiting.append(message)
         return True
 
@@ -351,6 +362,7 @@ class FolderTransport(ThreadTransport):
         """Move the files whose rows are all stored; one with rows that were ahead of our clock comes again."""
         while not self._released.empty():
             read = self._released.get()
+            self._in_hand.pop(read.file.name, None)
             if read.is_refused:
                 self._settled.pop(read.file.name, None)
                 self._digests = {digest: name for digest, name in self._digests.items() if name != read.file.name}

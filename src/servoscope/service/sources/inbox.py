@@ -91,6 +91,7 @@ class Inbox:
         self._resume = resume
         self._newest = {asset: (position.stream, position.sequence) for asset, position in resume.items()}
         self._confirmed = dict(self._newest)
+        self.transport.state_file = self.state_file
         if self.state_file is not None and self.decoder.trial is not None:
             try:
                 self._guard = MessageGuard(self.state_file, *self.decoder.trial)

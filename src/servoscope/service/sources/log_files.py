@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import fnmatch
+import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,11 +16,13 @@ import numpy as np
 from pydantic import Field
 
 from servoscope.core.arrays import FloatArray
-from servoscope.core.errors import ConfigError, RecordingError, ServoscopeError
+from servoscope.core.errors import ConfigError, OutputError, RecordingError, ServoscopeError
+from servoscope.core.files import atomic_write
 from servoscope.core.settings import NonEmptyStr
 from servoscope.models.loop import Loop
+from servoscope.service.log import log
 from servoscope.service.sources.settings import SourceSettings
-from servoscope.signals.readers.reader_process import run_restricted
+from servoscope.signals.readers.reader_process import answered_error, error_answer, run_restricted
 from servoscope.signals.readers.recording_file import first_time, read_log
 from servoscope.signals.samples import Samples
 
@@ -68,6 +71,38 @@ class IncompleteFile(NamedTuple):
     version: FileVersion
     unchanged_since: float
     seen_since: float
+
+
+class HandedFiles:
+    """The files that were handed over and are not dealt with, noted in a file: rows of theirs alone may be counted.
+
+    `path`: None where nothing can be noted.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self._path, self._noted = path, dict[str, FileVersion]()
+        self._before: dict[str, FileVersion] | None = None  # of an earlier process; None: nobody knows
+        if path is not None:
+            try:
+                noted = json.loads(path.read_bytes()) if path.exists() else {}
+                self._before = {str(name): FileVersion(*version) for name, version in noted.items()}
+            except (OSError, ValueError, TypeError, AttributeError):
+                log("warning", "files in hand cannot be read", file=str(path))
+
+    def may_be_counted(self, file: LogFile) -> bool:
+        """Whether an earlier process may have counted rows of a file that lay there at first."""
+        return self._before is None or self._before.get(file.name) == file.version
+
+    def note(self, files: Iterable[LogFile]) -> None:
+        """Note the files that are handed over from now on, and those that are in hand, of an earlier process too."""
+        noted = {**(self._before or {}), **{file.name: file.version for file in files}}
+        if self._path is None or noted == self._noted:
+            return
+        try:
+            atomic_write(self._path, json.dumps(noted).encode())
+        except OutputError as error:
+            log("warning", "files in hand cannot be noted", why=str(error))
+        self._noted = noted
 
 
 class FileRows(NamedTuple):
@@ -119,35 +154,72 @@ class FileNames:
         return self.assets[groups["asset"]] if "asset" in groups else self._only, groups.get("time", "")
 
 
+Parsed = tuple[dict[str, FileRows], dict[str, str]]  # rows by asset; of which assets they cannot be used, and why
+
+
+def parse_files(
+    folder: Path, files: Sequence[LogFile], names: FileNames, settings: FolderNames, loop_of: Mapping[str, Loop]
+) -> list[Parsed | ServoscopeError]:
+    """Return what each of some files holds, or why it cannot be read; in one exchange with a restricted process.
+
+    Raises RecordingError if one of them ended that process, OutputError where there is no room.
+    """
+    loops = dict(loop_of)
+    if all(file.asset for file in files):
+        loops = {file.asset: loop_of[file.asset] for file in files}
+    path, size = folder / (files[0].name if len(files) == 1 else ""), sum(file.version.size for file in files)
+    about, columns = run_restricted(
+        (folder,), path, size, f"{__name__}:pack_files", folder, list(files), names, settings, loops
+    )
+    others = iter(columns)
+    return [_unpack_file(described, others) for described in about]
+
+
 def parse_file(
     folder: Path, file: LogFile, names: FileNames, settings: FolderNames, loop_of: Mapping[str, Loop]
-) -> tuple[dict[str, FileRows], dict[str, str]]:
+) -> Parsed:
     """Return the rows of a file by asset, and of which assets they cannot be used, and why; in a restricted process.
 
     Raises RecordingError if the file cannot be read.
     """
-    loops = {file.asset: loop_of[file.asset]} if file.asset else dict(loop_of)
-    given = (folder, file, names, settings, loops)
-    about, columns = run_restricted((folder,), folder / file.name, file.version.size, f"{__name__}:pack_rows", *given)
-    rows, others = dict[str, FileRows](), iter(columns)
+    (parsed,) = parse_files(folder, [file], names, settings, loop_of)
+    if isinstance(parsed, ServoscopeError):
+        raise parsed
+    return parsed
+
+
+def _unpack_file(about: dict[str, Any], columns: Iterator[FloatArray]) -> Parsed | ServoscopeError:
+    if "error" in about:
+        return answered_error(about)
+    rows = dict[str, FileRows]()
     for name, offset, channels in about["rows"]:
-        t, r, u, y, restart = (next(others) for _ in range(5))
-        carried = {channel: next(others) for channel in channels}
+        t, r, u, y, restart = (next(columns) for _ in range(5))
+        carried = {channel: next(columns) for channel in channels}
         rows[str(name)] = FileRows(Samples.from_columns(t, r, u, y, restart, carried), float(offset))
-    return {name: rows[name] for name in loops if name in rows}, about["failures"]
+    return rows, about["failures"]
 
 
-def pack_rows(*given: Any) -> tuple[dict[str, Any], list[FloatArray]]:
-    """Return what `extract_rows` finds, as `run_restricted` takes it."""
-    rows, failures = extract_rows(*given)
-    columns = [x for own in rows.values() for x in (*own.samples.columns, *own.samples.channels.values())]
-    about = [(name, own.offset, list(own.samples.channels)) for name, own in rows.items()]
-    return {"rows": about, "failures": failures}, columns
+def pack_files(
+    folder: Path, files: Sequence[LogFile], names: FileNames, settings: FolderNames, loop_of: Mapping[str, Loop]
+) -> tuple[list[dict[str, Any]], list[FloatArray]]:
+    """Return what `extract_rows` finds in each of some files, as `run_restricted` takes it."""
+    about, columns = list[dict[str, Any]](), list[FloatArray]()
+    for file in files:
+        loops = {file.asset: loop_of[file.asset]} if file.asset else loop_of
+        try:
+            rows, failures = extract_rows(folder, file, names, settings, loops)
+        except ServoscopeError as error:
+            about.append(error_answer(error))
+            continue
+        columns += [x for own in rows.values() for x in (*own.samples.columns, *own.samples.channels.values())]
+        told = [(name, own.offset, list(own.samples.channels)) for name, own in rows.items()]
+        about.append({"rows": told, "failures": failures})
+    return about, columns
 
 
 def extract_rows(
     folder: Path, file: LogFile, names: FileNames, settings: FolderNames, loop_of: Mapping[str, Loop]
-) -> tuple[dict[str, FileRows], dict[str, str]]:
+) -> Parsed:
     """Do what `parse_file` does, in this process."""
     rows, failures, path = dict[str, FileRows](), dict[str, str](), folder / file.name
     loops = {loop.hash(): loop for loop in loop_of.values()}
@@ -168,7 +240,7 @@ def extract_rows(
                 named = _named_time(file.time, loop)
                 offset = file.modified_at - last if named is None else named - first
             rows[name] = FileRows(samples, offset)
-    return rows, failures
+    return {name: rows[name] for name in loop_of if name in rows}, failures
 
 
 def _named_time(text: str, loop: Loop) -> float | None:

@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -162,6 +163,7 @@ class Transport(ABC):
     layer_seconds: Mapping[str, float] = NOTHING
     backlog: Backlog | None = None  # None: nothing can wait where it is seen
     pause_s = 0.0  # how long an asset may pause without being silent [s]
+    state_file: Path | None = None  # where it may note what must survive the process; set before `open`
 
     def __init__(self) -> None:
         self.waiting = deque[InboxMessage]()

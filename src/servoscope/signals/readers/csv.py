@@ -12,11 +12,21 @@ from typing import Any
 from servoscope.core.errors import EmptyRecordingError, RecordingError
 from servoscope.models.loop import TextLayout
 from servoscope.signals.readers.column_words import known_words
-from servoscope.signals.readers.layout import HEAD_ROWS, THOUSANDS, check_names, count_numeric, find_table
+from servoscope.signals.readers.layout import (
+    HEAD_ROWS,
+    THOUSANDS,
+    TableShape,
+    check_names,
+    find_table,
+    table_shape,
+)
 from servoscope.signals.readers.table import NULL_TEXTS, Table, TableFile, is_number, one_line_errors
 
 COMMENTS = ("#", "%", "//")
-DELIMITERS = (";", "\t", ",", "|", " ")
+DELIMITERS = {  # each with what a line holds that it splits
+    **{sign: re.compile(re.escape(sign)) for sign in (";", "\t", ",", "|")},
+    " ": re.compile(r"\S\s+\S"),
+}
 HEAD_BYTES = 1 << 16  # that tell the layout, where the table begins in them
 MIN_HEAD_LINES = 8  # a file of thousands of columns has fewer in so many bytes
 MAX_HEAD_BYTES = 1 << 22  # that are looked at otherwise: of long lines, or of many above the table
@@ -92,18 +102,15 @@ def detect_layout(path: Path, head: bytes, most: int, text: TextLayout, cut: boo
         )
     ends = [line.rstrip()[-1:] for line in plain if line.strip()]
     line_end = next((end for end in LINE_ENDS if ends.count(end) > 0.8 * len(ends)), "")
-    split = {delimiter: _split_lines(plain, delimiter, line_end) for delimiter in DELIMITERS if delimiter != line_end}
-    if line_end == ";":  # it is the delimiter where it also stands between cells
-        split |= {";": _split_lines(plain, ";", "")}
-    delimiter = max(split, key=lambda candidate: _score(split[candidate]))
-    rows = split[delimiter]
-    table = find_table(rows, str(path), header)
+    split = _split_by_each(plain, line_end)
+    delimiter, (rows, shape) = max(split.items(), key=lambda tried: tried[1][1].score)
+    table = find_table(rows, shape, str(path), header)
     used = "" if delimiter == line_end else line_end
     if table is None and has_more:
         return None
     if table is None:  # no row of numbers: the first line says what the columns are, and what follows is told later
-        delimiter = max(split, key=lambda candidate: len(next(filter(None, split[candidate]), [])))
-        first, cells = next((i, row) for i, row in enumerate(split[delimiter]) if row)
+        delimiter = max(split, key=lambda candidate: len(next(filter(None, split[candidate][0]), [])))
+        first, cells = next((i, row) for i, row in enumerate(split[delimiter][0]) if row)
         check_names(cells, str(path))
         named = tuple(cell or f"c{index}" for index, cell in enumerate(cells))
         return CsvLayout(delimiter, ".", named, first + 1, encoding, comments, used)
@@ -123,10 +130,21 @@ def detect_layout(path: Path, head: bytes, most: int, text: TextLayout, cut: boo
     return CsvLayout(delimiter, decimal, names, table.first, encoding, comments, used, thousands)
 
 
-def _score(rows: list[list[str]]) -> tuple[int, int]:
-    """Return how well a delimiter splits lines: rows of a table times its columns of numbers, two or more first."""
-    count, columns = count_numeric(rows)
-    return min(columns, 2), count * columns
+def _split_by_each(lines: list[str], line_end: str) -> dict[str, tuple[list[list[str]], TableShape]]:
+    """Return the cells of lines by each delimiter, and their shape; by those that lines hold if one makes a table."""
+    delimiters = [delimiter for delimiter in DELIMITERS if delimiter != line_end]
+    if line_end == ";":  # it is the delimiter where it also stands between cells
+        delimiters.append(";")
+
+    def split_by(delimiter: str) -> tuple[list[list[str]], TableShape]:
+        rows = _split_lines(lines, delimiter, "" if delimiter == line_end else line_end)
+        return rows, table_shape(rows)
+
+    held = [delimiter for delimiter in delimiters if any(map(DELIMITERS[delimiter].search, lines))]
+    split = {delimiter: split_by(delimiter) for delimiter in held}
+    if any(len(shape.numeric) > 1 for _, shape in split.values()):
+        return split
+    return {delimiter: split.get(delimiter) or split_by(delimiter) for delimiter in delimiters}
 
 
 def _split_lines(lines: list[str], delimiter: str, line_end: str) -> list[list[str]]:
@@ -140,6 +158,8 @@ def _strip_end(line: str, end: str) -> str:
 def _detect_decimal(rows: list[list[str]]) -> tuple[str, str]:
     """Return the decimal sign, and the one between thousands, empty where there is none."""
     cells = [cell for row in rows for cell in row]
+    if not any("," in cell for cell in cells):
+        return ".", ""
     if (grouped := next(filter(THOUSANDS.fullmatch, cells), None)) is not None:
         return (",", ".") if grouped.rfind(",") > grouped.rfind(".") else (".", ",")
     comma = sum(re.fullmatch(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?", cell) is not None for cell in cells)
@@ -288,6 +308,8 @@ def _split_cells(line: str, delimiter: str) -> list[str]:
 
     if delimiter == " ":
         cells = line.split()
+    elif '"' not in line:
+        cells = line.split(delimiter)
     else:
         try:
             cells = next(csv.reader([line[:MAX_HEAD_BYTES]], delimiter=delimiter, skipinitialspace=True), [])

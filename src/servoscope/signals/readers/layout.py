@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from servoscope.core.errors import RecordingError
 from servoscope.signals.readers.clock import is_clock
@@ -32,6 +33,19 @@ class TableStart:
     first: int
 
 
+class TableShape(NamedTuple):
+    """How many columns a table has, which of them hold numbers, and which rows look like rows of it."""
+
+    width: int
+    numeric: list[int]
+    begun: list[bool]
+
+    @property
+    def score(self) -> tuple[int, int]:
+        """How well its lines are split: rows times columns of numbers, two or more columns first."""
+        return min(len(self.numeric), 2), sum(self.begun) * len(self.numeric)
+
+
 def is_numeric(cell: str) -> bool:
     """Tell whether a cell is a number, with a point or a comma, or a unit behind it, or a date or time."""
     return (
@@ -43,19 +57,17 @@ def is_numeric(cell: str) -> bool:
     )
 
 
-def count_numeric(rows: Sequence[Sequence[str]]) -> tuple[int, int]:
-    """Return how many rows look like rows of a table, and how many columns of numbers it has."""
-    width, numeric = _table_shape(rows)
-    return sum(_is_row(row, width, numeric) for row in rows), len(numeric)
-
-
-def find_table(rows: Sequence[Sequence[str]], name: str, header: int | None = None) -> TableStart | None:
+def find_table(
+    rows: Sequence[Sequence[str]], shape: TableShape, name: str, header: int | None = None
+) -> TableStart | None:
     """Find a table among rows of cells; None if there is none.
 
     Parameters
     ----------
     rows
         The first rows of a file; blank lines are rows without cells.
+    shape
+        What `table_shape` says of them.
     name
         What errors call the file.
     header
@@ -63,8 +75,7 @@ def find_table(rows: Sequence[Sequence[str]], name: str, header: int | None = No
 
     Raises RecordingError if two columns have the same name, or channels of TwinCAT Scope were sampled differently.
     """
-    width, numeric = _table_shape(rows)
-    begun = [_is_row(row, width, numeric) for row in rows]
+    width, numeric, begun = shape
     for first, here in enumerate(begun):
         ahead = begun[first : first + LOOKAHEAD_ROWS]
         # a first row with text among its numbers is one of a header, unless the next one is a row too
@@ -91,8 +102,8 @@ def check_names(names: Sequence[str], file: str) -> None:
         raise RecordingError(f"{file}: two columns are called {twice!r}, rename one of them")
 
 
-def _table_shape(rows: Sequence[Sequence[str]]) -> tuple[int, list[int]]:
-    """Return how many columns most of the last rows have, and which of them hold numbers."""
+def table_shape(rows: Sequence[Sequence[str]]) -> TableShape:
+    """Return the shape of the table in rows of cells: as wide as most of the last rows are."""
     tail = [row for row in rows if row][-max(1, len(rows) // 2) :]
     widths = [len(row) for row in tail]
     width = max(dict.fromkeys(widths), key=widths.count, default=0)
@@ -102,7 +113,7 @@ def _table_shape(rows: Sequence[Sequence[str]]) -> tuple[int, list[int]]:
         filled = [row[index] for row in same if row[index].strip() not in NULL_TEXTS]
         if filled and sum(map(is_numeric, filled)) > 0.5 * len(filled):
             numeric.append(index)
-    return width, numeric
+    return TableShape(width, numeric, [_is_row(row, width, numeric) for row in rows])
 
 
 def _is_row(row: Sequence[str], width: int, numeric: Sequence[int]) -> bool:

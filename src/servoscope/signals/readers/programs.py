@@ -12,7 +12,7 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import RecordingError
 from servoscope.signals.readers.clock import is_clock
-from servoscope.signals.readers.layout import HEAD_ROWS, check_names, find_table
+from servoscope.signals.readers.layout import HEAD_ROWS, check_names, find_table, table_shape
 from servoscope.signals.readers.table import TableFile, check_width, is_number, one_line_errors, shorten_error
 
 
@@ -37,7 +37,8 @@ def open_sheet(path: Path) -> TableFile:
 def _find_sheet_table(path: Path, rows: Sequence[Sequence[Any]]) -> TableFile | None:
     """Return the table of a sheet, None if it has none."""
     head = [[_cell_text(cell) for cell in row] for row in rows[:HEAD_ROWS]]
-    table = find_table([row if any(row) else [] for row in head], str(path))
+    cells = [row if any(row) else [] for row in head]
+    table = find_table(cells, table_shape(cells), str(path))
     if table is None:
         return None
     check_width(path, len(table.names))

@@ -12,7 +12,7 @@ import json
 import os
 import shutil
 import weakref
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,7 +36,8 @@ from servoscope.core.temporary import temporary_folder, temporary_folders_in
 from servoscope.core.workers import ProcessLimits, Progress, WorkerError, Workers
 from servoscope.signals.readers.table import Table, TableFile, rows_wanted
 
-BASE_S, BYTES_PER_S = 15.0, 5e5  # that a small file may take, and what is larger, by the clock on the wall
+BASE_S, BYTES_PER_S = 15.0, 5e5  # of processor time that a small file may take, and what is larger
+WALL_TIME_FACTOR = 10.0  # how much longer it may take by the clock on the wall, on a busy machine or a slow share
 LIMITS = ProcessLimits(cpu_s=1e6, memory_mb=8000.0, file_mb=1e6)  # a task's time is bound, not the process's
 LIBRARIES = (
     "pandas",
@@ -80,13 +81,15 @@ def run_restricted(
     scratch = Path(kept) / uuid4().hex  # removed whatever becomes of the process
     sandbox = Sandbox(read=tuple(map(str, readable)), write=(kept,))
     libraries = (__name__, task.partition(":")[0], *TEXT_LIBRARIES)
-    timeout_s = BASE_S + size / BYTES_PER_S
+    cpu_s = BASE_S + size / BYTES_PER_S
     try:
         scratch.mkdir()
         given = (f"{__name__}:run_task", task, arguments, str(scratch))
-        answer = _workers.run(*given, timeout_s=timeout_s, libraries=libraries, sandbox=sandbox)
+        answer = _workers.run(
+            *given, timeout_s=WALL_TIME_FACTOR * cpu_s, cpu_s=cpu_s, libraries=libraries, sandbox=sandbox
+        )
         if "error" in answer:
-            raise ERRORS.get(answer["kind"], RecordingError)(str(answer["error"]))
+            raise answered_error(answer)
         with (scratch / COLUMNS).open("rb") as file:
             return answer["about"], [np.fromfile(file, count=int(rows)) for rows in answer["rows"]]
     except WorkerError as error:
@@ -107,14 +110,24 @@ def run_task(_progress: Progress, task: str, arguments: tuple[Any, ...], scratch
         with temporary_folders_in(scratch):
             about, columns = getattr(importlib.import_module(module), name)(*arguments)
     except ServoscopeError as error:
-        return {"error": str(error), "kind": type(error).__name__}
+        return error_answer(error)
     try:
         with Path(scratch, COLUMNS).open("wb") as file:
             for column in columns:
                 np.ascontiguousarray(column, np.float64).tofile(file)
     except OSError as error:
-        return {"error": f"{scratch}: cannot be written ({error.strerror}), make room", "kind": OutputError.__name__}
+        return error_answer(OutputError(f"{scratch}: cannot be written ({error.strerror}), make room"))
     return {"about": about, "rows": [len(column) for column in columns]}
+
+
+def error_answer(error: ServoscopeError) -> dict[str, Any]:
+    """Return an error as a task answers it."""
+    return {"error": str(error), "kind": type(error).__name__}
+
+
+def answered_error(answer: Mapping[str, Any]) -> ServoscopeError:
+    """Return the error that a task has answered."""
+    return ERRORS.get(answer["kind"], RecordingError)(str(answer["error"]))
 
 
 def open_bounded(path: Path, kind: str, module: str, function: str, library: str, *layout: Any) -> TableFile:
@@ -123,7 +136,7 @@ def open_bounded(path: Path, kind: str, module: str, function: str, library: str
     `kind`: what errors call the file; `module`, `function`: what opens it, with `library`, given the path and `layout`.
     Raises RecordingError if it cannot be read, also where it would take more time or memory than files of its size do.
     """
-    timeout_s = BASE_S + path.stat().st_size / BYTES_PER_S
+    cpu_s = BASE_S + path.stat().st_size / BYTES_PER_S
     place = (module, function, str(path.absolute()), str(path), layout)
     folder = temporary_folder("read")
     target, sandbox = Path(folder.name) / "rows.arrow", Sandbox(read=(place[2],), write=(folder.name,))
@@ -134,7 +147,8 @@ def open_bounded(path: Path, kind: str, module: str, function: str, library: str
                 f"{__name__}:{task}",
                 *place,
                 *arguments,
-                timeout_s=timeout_s,
+                timeout_s=WALL_TIME_FACTOR * cpu_s,
+                cpu_s=cpu_s,
                 libraries=(__name__, module, library, *LIBRARIES),
                 sandbox=sandbox,
             )
