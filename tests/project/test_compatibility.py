@@ -43,6 +43,7 @@ ADDED = {
     ),
     # of the service: how samples come in, blocks left out for their time stamps, clocks of a fault that stands
     *("reception", "late", "future", "fault_at", "diagnosed", "size", "sized", "source", "signature"),
+    "baseline",  # of each row of a diagnosis
 }
 # Where version 0.1.0 fitted a delay of noise, the likelihood says 0 [s].
 TOLERANCE = {"delay_s": 1e-4}

@@ -14,7 +14,11 @@ from pages_context import open_context
 from test_web_uploads import ask
 
 from servoscope.service.access import WebSettings
+from servoscope.service.assets.examination import undetermined
+from servoscope.service.assets.examination_schedule import PendingDiagnosis
+from servoscope.service.assets.records import diagnosis_row
 from servoscope.service.store import Batch
+from servoscope.service.store.rows import BASELINE_NOTE
 from servoscope.web.dependencies import Context
 from servoscope.web.event_hub import ROWS_PER_EVENT
 
@@ -28,7 +32,12 @@ def write(context: Context, commit: int, **statistics: float) -> None:
         number = int(name.removeprefix("press_"))
         status: dict[str, Any] = {"verdict": "fault" if number % 100 == 7 else "healthy", "summary": "As it was."}
         status |= {"since": 0.0, "onset": None, "examined": None, "ne107": "good", "reasons": [], "quality": {}}
-        status |= {"alarms": {}, "statistic": statistic, "level": 0.0, "about": {"group": f"hall {number % 2}"}}
+        status |= {
+            "alarms": {},
+            "statistic": statistic,
+            "level": 0.0,
+            "about": {"group": f"hall {number % 2}", "baseline": "present"},
+        }
         if number % 50 == 3:
             status["alarms"] = {"limit": {"state": "unacknowledged", "since": 0.0, "priority": "high"}}
         if number % 100 == 9:
@@ -85,6 +94,21 @@ def test_pages_are_parts_of_the_whole_list_the_most_urgent_first(context: Contex
         assert names(answer) == [name for name in names(whole) if text in shown[name]], text
     assert len(names(healthy)) > 200 and len(names(fault)) == 5
     assert whole.headers["content-encoding"] == "gzip" and len(whole.content) > 50_000
+
+
+def test_an_undetermined_diagnosis_names_the_baseline_that_it_was_made_with(context: Context) -> None:
+    window = PendingDiagnosis(1, 0, 100.0, "full")
+    made = diagnosis_row(window, undetermined("crashed"), "0" * 16).values
+    earlier = {**made, "number": 2, "document": {"said": made["document"]["said"]}}  # of an earlier version
+    batch = Batch()
+    rows = (made, earlier, {**earlier, "number": 3, "t": 300.0})
+    batch.rows["diagnoses"] += [{"asset": "press_1", **row} for row in rows]
+    context.store.write(batch, "hall", 3)
+    note = {"t": 200.0, "text": "baseline 2", "anew": True, "kind": BASELINE_NOTE}
+    context.store.add_audit("vera", "press_1", "note", note)
+    answers = ask(context, *(("GET", f"/diagnoses/press_1@{number}", None) for number in (1, 2, 3)))
+    assert [answer.json()["baseline"]["hash"] for answer in answers] == ["0" * 16, "", "present"]
+    assert answers[0].json()["document"] == {}
 
 
 def events(text: bytes) -> list[tuple[bool, list[dict[str, Any]]]]:

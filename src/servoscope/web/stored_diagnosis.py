@@ -9,7 +9,7 @@ from servoscope.core.messages import Message, render
 from servoscope.diagnosis.result import Diagnosis
 
 # keys of a stored document that are no fields of the diagnosis
-STORED_BESIDE = ("began", "signature", "said", "evidence", "arm")
+STORED_BESIDE = ("began", "signature", "said", "evidence", "arm", "baseline")
 
 
 def read_diagnosis(document: Mapping[str, Any]) -> Diagnosis | None:

@@ -44,7 +44,7 @@ from servoscope.service.assets.records import (
     StepResult,
     TableRow,
     check_continuity,
-    diagnosis_row,
+    diagnosed_rows,
     owed_rows,
     transition_row,
 )
@@ -318,8 +318,7 @@ class Asset(StateHolder):
         pending = tuple(waiting for waiting in state.pending_diagnoses if waiting != window)
         self.state = replace(state, examination=examination, pending_diagnoses=pending)
         self._window.trim(state.position.t, pending)
-        named = fault_rows(window.until, "full", diagnosis.document.get("faults", []))
-        return StepResult([diagnosis_row(window, diagnosis), *(TableRow("sizes", row) for row in named)], [])
+        return StepResult(diagnosed_rows(window, diagnosis, state.baseline), [])
 
     def _next_row_number(self) -> int:
         position = self.take_state().position
@@ -382,7 +381,7 @@ class Asset(StateHolder):
             rows = fault_rows(t, "live", [result.size.model_dump(mode="json")])
             self._result.rows.extend(TableRow("sizes", row) for row in rows)
         if result.verdict != state.examination.verdict:
-            self._add_row("diagnoses", t=t, grounds="examination", **result.columns())
+            self._add_row("diagnoses", t=t, grounds="examination", **result.columns(state.baseline))
         examination, in_full = schedule_full_diagnosis(examination, self._schedule, t)
         if in_full:
             window = PendingDiagnosis(self._next_row_number(), recent()[0].sequence, self._schedule.end(t), "full")

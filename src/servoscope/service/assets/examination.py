@@ -47,9 +47,9 @@ class StoredDiagnosis(BaseModel):
         """The headline as text."""
         return render(self.headline)
 
-    def columns(self) -> dict[str, Any]:
-        """Return its columns in the table of diagnoses."""
-        document = {**self.document, "said": self.headline.model_dump(mode="json")}
+    def columns(self, baseline: str) -> dict[str, Any]:
+        """Return its columns in the table of diagnoses; `baseline`: hash of the one that it was made with."""
+        document = {**self.document, "said": self.headline.model_dump(mode="json"), "baseline": baseline}
         return {"verdict": self.verdict, "summary": self.summary, "onset": self.onset, "document": document}
 
     def with_onset(self, onset: float | None) -> StoredDiagnosis:

@@ -10,6 +10,7 @@ from servoscope.service.assets.checkpoint import AssetState, StreamPosition
 from servoscope.service.assets.examination import StoredDiagnosis, undetermined
 from servoscope.service.assets.examination_schedule import PendingDiagnosis
 from servoscope.service.sources.block import Block
+from servoscope.service.store.rows import fault_rows
 
 # tables of what the samples and the state before them lead to, whenever and however often that is computed
 REPEATABLE_TABLES = frozenset({"recent", "residuals", "sizes"})
@@ -50,10 +51,16 @@ def transition_row(transition: AlarmTransition, definition: AlarmDefinition) -> 
     return {"t": transition.time, **columns, "document": {"event": plain["event"], "priority": definition.priority}}
 
 
-def diagnosis_row(window: PendingDiagnosis, diagnosis: StoredDiagnosis) -> TableRow:
-    """Return the row of a full diagnosis, under the number that was kept for it."""
-    values = {"number": window.number, "t": window.until, "grounds": window.why, **diagnosis.columns()}
+def diagnosis_row(window: PendingDiagnosis, diagnosis: StoredDiagnosis, baseline: str) -> TableRow:
+    """Return the row of a full diagnosis by the baseline of this hash, under the number that was kept for it."""
+    values = {"number": window.number, "t": window.until, "grounds": window.why, **diagnosis.columns(baseline)}
     return TableRow("diagnoses", values)
+
+
+def diagnosed_rows(window: PendingDiagnosis, diagnosis: StoredDiagnosis, baseline: str) -> list[TableRow]:
+    """Return the row of a full diagnosis, and those of the sizes that it has found."""
+    named = fault_rows(window.until, "full", diagnosis.document.get("faults", []))
+    return [diagnosis_row(window, diagnosis, baseline), *(TableRow("sizes", row) for row in named)]
 
 
 def owed_rows(before: AssetState | None) -> list[TableRow]:
@@ -61,8 +68,9 @@ def owed_rows(before: AssetState | None) -> list[TableRow]:
 
     Their numbers would be lacking in the history.
     """
-    waiting = () if before is None else before.pending_diagnoses
-    return [diagnosis_row(window, undetermined("renewed")) for window in waiting]
+    if before is None:
+        return []
+    return [diagnosis_row(window, undetermined("renewed"), before.baseline) for window in before.pending_diagnoses]
 
 
 class BlockContinuity(NamedTuple):

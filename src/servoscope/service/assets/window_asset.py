@@ -87,7 +87,7 @@ class WindowAsset(Asset):
         state = self.take_state()  # its rows are counted
         self.state = replace(state, examination=examination, evaluation=evaluation, pending_diagnoses=pending)
         if is_row:
-            self._result.rows.append(diagnosis_row(window, diagnosis))
+            self._result.rows.append(diagnosis_row(window, diagnosis, state.baseline))
         self._add_sizes(fault_rows(t, "full" if is_row else "live", faults))
         self._window.trim(state.position.t, pending)
         self._advance_alarms(state.position.t)

@@ -18,7 +18,8 @@ from servoscope.report.document import to_json
 from servoscope.service.assets.status import AssetMetadata
 from servoscope.service.store import tables
 from servoscope.service.store.queries import query_history
-from servoscope.service.store.series import read_checks
+from servoscope.service.store.rows import BASELINE_NOTE
+from servoscope.service.store.series import read_checks, read_notes
 from servoscope.web.checks import asset_machine, fault_checks
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
 from servoscope.web.jobs.queue import Job
@@ -104,7 +105,9 @@ def _asset_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
     if facts is not None and facts.model_fields_set:
         # of the diagnosis, which an asset that has learned again since no longer has
         used = diagnosis.provenance if diagnosis is not None else None
-        known_hash = used.baseline if used is not None else facts.baseline or ""
+        known_hash = used.baseline if used is not None else beside["baseline"]
+        if known_hash is None:  # of earlier versions
+            known_hash = "" if _has_learned_again(context, asset, rows[0]["t"]) else facts.baseline or ""
         baseline = responses.BaselineRef(id=asset_baseline_id(context, asset), name=asset, hash=known_hash)
     known = _asset_context(context, asset, diagnosis, facts)._replace(began=began, onset=rows[0]["onset"])
     return responses.DiagnosisDetail(
@@ -117,6 +120,11 @@ def _asset_diagnosis(context: Context, id_: str) -> responses.DiagnosisDetail:
         baseline=baseline,
         units=signal_units(facts.units) if facts is not None else None,
     )
+
+
+def _has_learned_again(context: Context, asset: str, t: float) -> bool:
+    notes = read_notes(context.store, asset)
+    return any(note["kind"] == BASELINE_NOTE and note["t"] > t for note in notes)
 
 
 def _asset_context(
