@@ -105,9 +105,10 @@ class OpcuaServer:
             log("error", "OPC UA server stopped", why=self._trouble)
         finally:
             self._started.set()
-            for task in (left := asyncio.all_tasks(self._loop)):  # sessions of the library, which wait for their end
+            for task in asyncio.all_tasks(self._loop):  # sessions of the library, which wait for their end
                 task.cancel()
-            self._loop.run_until_complete(asyncio.gather(*left, return_exceptions=True))
+                with contextlib.suppress(asyncio.CancelledError):
+                    self._loop.run_until_complete(task)
             self._loop.close()
 
     async def _run(self) -> None:
