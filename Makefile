@@ -65,6 +65,7 @@ pictures: $(STAMP)  ## the pictures of README and docs, with the record of what 
 	$(BIN)/python benchmarks accuracy/nonlinear --figure docs/images/nonlinear-rig.png
 	$(BIN)/python benchmarks accuracy/cylinder_plants --picture docs/images/cylinder.png
 	$(BIN)/servoscope reproduce --seeds 20 -o build/paper && cp build/paper/*.png docs/images/paper
+	$(BIN)/python scripts/hand_over.py --write
 	$(BIN)/python scripts/pictures.py --record
 	SCREENSHOTS=docs/images/pages $(BIN)/python -m pytest -n 0 tests/web/test_web_pages.py tests/web/test_web_action.py tests/web/test_web_files.py
 

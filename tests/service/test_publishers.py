@@ -1,4 +1,5 @@
-"""Files for foreign systems, judged by foreign programs: shells by aas-core and the official test engines."""
+"""Files for foreign systems, judged by foreign programs: shells by aas-core and the official test engines, a work list
+by the CSV reader of another stack."""
 
 from __future__ import annotations
 
@@ -13,8 +14,10 @@ from brokers import until
 from test_opcua import STATUS
 
 from servoscope.service.assets.status import AssetStatus, read_status
+from servoscope.service.assets.work_items import WorkItem, work_items
 from servoscope.service.kinds import PUBLISHERS, find_kinds
-from servoscope.service.publishers.aas import CONCEPT, TEMPLATE, package, shell
+from servoscope.service.publishers.aas import CONCEPT, TEMPLATE, AasPublisher, package, shell
+from servoscope.service.publishers.worklist import to_csv
 
 ALARM = {"state": "unacknowledged", "since": 1.0, "priority": "high", "cause": "Leakage.", "active": True}
 OUTLOOK = {"name": "leakage", "limit": 1.5, "outlook": "forecast", "t": 1767225600.0, "asked": 1767225600.0,
@@ -150,3 +153,104 @@ def test_files_follow_the_status_and_say_why_they_cannot(tmp_path: Path) -> None
     until(lambda: not outlet.trouble and file.is_file())
     outlet.close()
     outlet.close()
+
+
+def test_only_what_has_changed_is_rendered_and_all_files_are_as_if_everything_were(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Oracle: a publisher that is told of all assets at once."""
+    rendered = list[list[str]]()
+    render = AasPublisher.render
+
+    def noted(self: AasPublisher, statuses: Any, changed: Any) -> Any:
+        rendered.append(sorted(changed))
+        return render(self, statuses, changed)
+
+    monkeypatch.setattr(AasPublisher, "render", noted)
+    stored = {**status(), "counted": {"began": 0.0, "t": 1767225640.0}}
+    fleet = {name: {**stored, "summary": f"{name} 0"} for name in ("lift", "press", "saw")}
+    kind = find_kinds(PUBLISHERS)["aas"].load()
+    outlet, oracle = (kind(kind="aas", path=path, every_s=600.0).create("twin", tmp_path) for path in ("one", "all"))
+    outlet.open(fleet)
+    (tmp_path / "one/press.json").unlink()
+    (tmp_path / "one/press.json").mkdir()
+    for k, names in enumerate((["press"], ["saw"], ["lift", "saw"]), 1):
+        news = {name: {**stored, "summary": f"{name} {k}"} for name in names}
+        outlet.publish(news)
+        outlet._write()
+        fleet |= news
+        if k == 2:
+            (tmp_path / "one/press.json").rmdir()
+    outlet.close()
+    # what could not be written is tried again, and nothing when nothing has changed
+    assert rendered == [["lift", "press", "saw"], ["press"], ["press", "saw"], ["lift", "press", "saw"], []]
+    oracle.open(fleet)
+    oracle.close()
+    one, every = ({path.name: path.read_bytes() for path in (tmp_path / name).iterdir()} for name in ("one", "all"))
+    assert one == every and len(one) == 6
+
+
+ABOUT = {"group": "hall 2", "faults": {"leakage": "leakage"}, "checks": {"leakage": ["Seals.", "Valve; return line."]}}
+
+
+def test_a_work_list_says_what_to_check_since_when_how_large_and_how_urgent() -> None:
+    data = {"state": "shelved", "since": 5.0, "priority": "medium", "cause": "y is frozen.", "active": True,
+            "ne107": "out_of_specification"}  # fmt: skip
+    critical = {**ALARM, "priority": "critical", "cause": "The limit is near.", "ne107": "maintenance_required"}
+    alarms = {"fault": {**ALARM, "ne107": "maintenance_required"}, "limit": critical, "data_quality": data}
+    fault, quality = work_items("press", asset(about=ABOUT, alarms=alarms))
+    assert fault == WorkItem(
+        key="press:leakage", asset="press", group="hall 2", finding="leakage", since="2025-12-31T23:59:40Z",
+        parameter="C_ie", size=1.2, size_low=1.1, size_high=1.3, check=("Seals.", "Valve; return line."),
+        urgency="critical", due="2026-01-11T00:00:00Z", ne107="failure",
+    )  # fmt: skip
+    assert quality[:5] == ("press:data_quality", "press", "hall 2", "y is frozen.", "1970-01-01T00:00:05Z")
+    assert (quality.urgency, quality.ne107, quality.size, quality.due) == ("medium", "out_of_specification", None, "")
+
+
+NOTHING: dict[str, Any] = {"faults": [], "alarms": {}, "outlook": None, "ne107": "good", "verdict": "healthy"}
+GONE = {"fault": {**ALARM, "state": "latched_unacknowledged", "active": False}}
+OUT = {"fault": {**ALARM, "state": "out_of_service", "ne107": "maintenance_required"}}
+
+
+@pytest.mark.parametrize(
+    ("keys", "found"),
+    [
+        (NOTHING, []),
+        ({**NOTHING, "alarms": GONE}, []),  # nothing to do but to reset it
+        ({**NOTHING, "verdict": "suspect", "ne107": "maintenance_required"}, ["suspect low"]),
+        ({**NOTHING, "verdict": "fault", "ne107": "failure"}, ["unknown medium"]),
+        ({**NOTHING, "verdict": "fault", "ne107": "failure", "alarms": OUT}, ["unknown medium"]),
+        ({"faults": [FAULT, {**FAULT, "name": "friction"}]}, ["leakage high", "friction high"]),
+    ],
+)
+def test_whatever_is_not_good_is_on_the_work_list(keys: dict[str, Any], found: list[str]) -> None:
+    items = work_items("press", asset(**keys))
+    assert [f"{item.key.removeprefix('press:')} {item.urgency}" for item in items] == found
+    assert bool(items) == (asset(**keys).ne107 != "good")
+
+
+def test_a_work_list_is_read_by_others_and_stays_as_it_is_while_only_samples_come(tmp_path: Path) -> None:
+    import pyarrow.csv
+
+    kind = find_kinds(PUBLISHERS)["worklist"].load()
+    outlet = kind(kind="worklist", path="work", every_s=600.0).create("hall.work", tmp_path)
+    low = {"alarms": {"fault": {**ALARM, "priority": "low"}}, "summary": '=Leck, "2"\n<&> µm ☃', "faults": []}
+    stored = {name: {**status(about=ABOUT, **keys), "counted": {"began": 0.0, "t": 1767225640.0}}
+              for name, keys in {"lift": low, "press": {}, "saw": NOTHING}.items()}  # fmt: skip
+    outlet.open({**stored, "hall": {"service": True}})
+    files = tmp_path / "work/worklist.csv", tmp_path / "work/worklist.json"
+    document = json.loads(files[1].read_text(encoding="utf-8"))
+    assert [item["key"] for item in document] == ["press:leakage", "lift:unknown"]  # the most urgent first
+    table = pyarrow.csv.read_csv(files[0], parse_options=pyarrow.csv.ParseOptions(newlines_in_values=True))
+    rows = table.to_pylist()
+    assert table.column_names == list(WorkItem._fields) == list(document[0])
+    assert [row["size_high"] for row in rows] == [1.3, None] and rows[0]["check"] == "Seals.; Valve; return line."
+    assert rows[1]["finding"] == "'" + low["summary"]  # no formula in a spreadsheet
+    times = [path.stat().st_mtime_ns for path in files]
+    outlet.publish({"press": {**stored["press"], "counted": {"began": 0.0, "t": 1767225700.0}}})
+    outlet._write()
+    assert [path.stat().st_mtime_ns for path in files] == times
+    outlet.publish({name: {**stored[name], **NOTHING} for name in ("lift", "press")})
+    outlet.close()
+    assert files[0].read_bytes() == to_csv([]).encode() and json.loads(files[1].read_text()) == []

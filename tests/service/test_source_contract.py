@@ -229,7 +229,7 @@ def test_publishing_neither_raises_nor_blocks_and_closing_twice_is_no_error(kind
     keys = {
         "mqtt": {"host": "127.0.0.1", "port": port, "every_s": 0.0},
         "opcua": {"listen": f"127.0.0.1:{port}"},
-        "aas": {"path": "shells", "every_s": 0.01},
+        **{key: {"path": "files", "every_s": 0.01} for key in ("aas", "ros2", "worklist")},
     }[kind]
     settings = find_kinds(PUBLISHERS)[kind].load().model_validate({"kind": kind, **keys})
     publisher = settings.create("hall.contract", tmp_path)

@@ -95,6 +95,10 @@ class PythonAlarmList:
         """Return the alarms that it shows."""
         return list(self._rows.values())
 
+    def value(self, node: str) -> Any:
+        """Return the value of a variable."""
+        return self._client.get_node(node).read_value()
+
     def acknowledge(self, row: Row, comment: str) -> str:
         """Acknowledge an alarm of its list; return the name of the status."""
         ua, node = self._ua, self._client.get_node(row["condition"])

@@ -24,10 +24,10 @@ BUILT_IN = tuple(  # written like the entry points of other packages, and loaded
         (SOURCES, "kafka", "kafka.source:KafkaSourceSettings"),
         (PUBLISHERS, "mqtt", "mqtt.publisher:MqttPublisherSettings"),
         (PUBLISHERS, "opcua", "opcua.server:OpcuaServerSettings"),
-        *(  # each file there but those that they share
-            (PUBLISHERS, module.name.replace("_", "-"), f"publishers.{module.name}:OutletSettings")
-            for module in pkgutil.iter_modules(publishers.__path__)
-            if module.name not in ("base", "files")
+        *(  # each file there but those that they share, by its name: `night_shift` has `NightShiftSettings`
+            (PUBLISHERS, name.replace("_", "-"), f"publishers.{name}:{name.title().replace('_', '')}Settings")
+            for _, name, _ in pkgutil.iter_modules(publishers.__path__)
+            if name not in ("base", "files")
         ),
     )
 )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -30,7 +30,7 @@ ZIP_DATE = (1980, 1, 1, 0, 0, 0)  # the same content has the same bytes
 Element = dict[str, Any]
 
 
-class OutletSettings(FilesSettings):
+class AasSettings(FilesSettings):
     """An outlet of kind ``aas``: the files ``ASSET.json`` and ``ASSET.aasx``."""
 
     kind: Literal["aas"]
@@ -45,15 +45,15 @@ class OutletSettings(FilesSettings):
 class AasPublisher(FilesPublisher):
     """Keeps a shell for each asset."""
 
-    def __init__(self, settings: OutletSettings, folder: Path) -> None:
+    def __init__(self, settings: AasSettings, folder: Path) -> None:
         super().__init__(folder / settings.path, settings.every_s)
         self._prefix = settings.prefix
 
-    def render(self, statuses: StatusByAsset) -> Mapping[str, bytes]:
-        """Return the files of all assets."""
+    def render(self, statuses: StatusByAsset, changed: Collection[str]) -> Mapping[str, bytes]:
+        """Return the two files of each asset that has changed."""
         files: dict[str, bytes] = {}
-        for name, stored in statuses.items():
-            status = read_status(stored)
+        for name in changed:
+            status = read_status(statuses[name])
             if isinstance(status, AssetStatus):
                 file = quote(name, safe="")
                 environment = json.dumps(shell(name, status, self._prefix), indent=1).encode()

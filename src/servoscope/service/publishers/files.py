@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +26,17 @@ class FilesPublisher:
     def __init__(self, folder: Path, every_s: float) -> None:
         self._folder, self._every_s = folder, every_s
         self._statuses: dict[str, Mapping[str, Any]] = {}
+        self._changed = set[str]()  # assets whose files are not yet up to date
         self._written: dict[str, bytes] = {}
         self._lock, self._stopping = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="files", daemon=True)
         self.trouble = ""  # why the files are not up to date
 
-    def render(self, statuses: StatusByAsset) -> Mapping[str, bytes]:
-        """Return the contents of all files by name; `statuses`: of assets alone."""
+    def render(self, statuses: StatusByAsset, changed: Collection[str]) -> Mapping[str, bytes]:
+        """Return by name the contents of the files that say something of the assets that have changed.
+
+        `statuses`: of all assets, without the service itself.
+        """
         raise NotImplementedError
 
     def open(self, statuses: StatusByAsset) -> None:
@@ -44,8 +48,10 @@ class FilesPublisher:
 
     def publish(self, statuses: StatusByAsset) -> None:
         """Take what has been stored."""
+        assets = {name: status for name, status in statuses.items() if "verdict" in status}
         with self._lock:
-            self._statuses |= {name: status for name, status in statuses.items() if "verdict" in status}
+            self._statuses |= assets
+            self._changed |= assets.keys()
 
     def _run(self) -> None:
         while not self._stopping.wait(self._every_s):
@@ -53,15 +59,18 @@ class FilesPublisher:
 
     def _write(self) -> None:
         with self._lock:
-            statuses = dict(self._statuses)
+            statuses, changed = dict(self._statuses), self._changed
+            self._changed = set()
         try:
-            for name, content in self.render(statuses).items():
+            for name, content in self.render(statuses, changed).items():
                 if self._written.get(name) != content:
                     atomic_write(self._folder / name, content)
                     self._written[name] = content
             self.trouble = ""
         except OutputError as error:  # a full disk, a share that is away: the next look tries again
             self.trouble = str(error)
+            with self._lock:
+                self._changed |= changed
 
     def close(self) -> None:
         """Write what is left, and stop."""
