@@ -145,7 +145,7 @@ def test_tags_of_an_export_are_loops() -> None:
     assert list(find_loops(["t", "r", "u", "y"])) == [""]
 
 
-def made(name: str, verdict: str, **values: float) -> Assessment:
+def made(name: str, verdict: str, from_s: float = 0.0, **values: float) -> Assessment:
     facts = [{"name": name.replace("_", " "), "value": value, "unit": ""} for name, value in values.items()]
     words = dict.fromkeys(("reason", "advice"), "")
     return Assessment.model_validate(
@@ -153,6 +153,8 @@ def made(name: str, verdict: str, **values: float) -> Assessment:
             "recording": name,
             "verdict": verdict,
             "kind": "valve",
+            "from_s": from_s,
+            "to_s": from_s + 1000.0,
             "samples": 9,
             "sample_rate_hz": 1.0,
             "facts": facts,
@@ -166,8 +168,20 @@ def test_loops_with_one_period_are_grouped_with_the_likeliest_source_first() -> 
     victim = made("b", "manual", oscillation=103.0, tracking_error=9.0)  # it does not answer, so it starts nothing
     other = made("c", "nothing conspicuous", oscillation=250.0, tracking_error=20.0)
     quiet = made("d", "nothing conspicuous", tracking_error=50.0)
-    assert group_by_period([victim, other, source]) == [(source, victim)]
+    tomorrow = made("a", "stiction", from_s=86400.0, oscillation=100.0)
+    assert group_by_period([victim, other, tomorrow, source]) == [(source, victim)]
     assert rank([quiet, victim, source, other]) == [source, victim, other, quiet]
+
+
+def test_dates_place_a_log_in_time_and_stretches_count_from_its_start(tmp_path: Path) -> None:
+    stamps = np.datetime64("2026-02-03T10:00:00") + np.arange(300) * np.timedelta64(10, "s")
+    log = tmp_path / "dated.csv"
+    rows = (f"{stamp},50,{u},{y}" for stamp, u, y in zip(stamps, loop(3)["u"], loop(3)["y"], strict=False))
+    log.write_text("\n".join(["Date,FIC1.SP,FIC1.OP,FIC1.PV", *rows]))
+    run = CliRunner().invoke(app, ["assess", str(log), "--json", "--from", "1000", "--to", "2500"])
+    result = json.loads(run.stdout)
+    begin = stamps[0].astype(float)
+    assert (result["from_s"], result["to_s"], result["samples"]) == (begin + 1000.0, begin + 2490.0, 150)
 
 
 def test_the_command_ranks_an_export_and_writes_pages_and_a_work_list(tmp_path: Path) -> None:

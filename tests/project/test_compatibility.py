@@ -205,9 +205,20 @@ def test_a_monitor_says_the_same_to_the_last_bit(tmp_path: Path) -> None:
     assert seen == set(FROZEN["traces"])
 
 
-# since 2.0: what the motion explains of u sets the cutoff, not the widest band of coherence; recordings have a hash
+# since 2.0: what the motion explains of u sets the cutoff, not the widest band of coherence; recordings have a hash;
+# a grid of more than 2^17 levels is how single precision is stored, no sensor's
 INTENDED = {
-    "inspect-axis": ["/0/suggested_cutoff_hz: 9.4, not 2.5"],
+    "inspect": [
+        "/0/quantisation/1/effective_bits: None, not 19.526241319061562",
+        "/0/quantisation/1/step: None, not 9.5367431640625e-07",
+    ],
+    "inspect-axis": [
+        "/0/quantisation/1/effective_bits: None, not 17.271709219263947",
+        "/0/quantisation/1/step: None, not 0.0009765625",
+        "/0/quantisation/2/effective_bits: None, not 17.304360235083713",
+        "/0/quantisation/2/step: None, not 2.384185791015625e-07",
+        "/0/suggested_cutoff_hz: 9.4, not 2.5",
+    ],
     "learn": ["/0/sources/healthy.parquet/hash: only in one"],
 }
 

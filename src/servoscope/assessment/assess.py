@@ -61,6 +61,8 @@ class Assessment(ShortRepr, BaseModel):
         Of the machine, for the advice.
     reason, advice
         Why, and what to look at.
+    from_s, to_s
+        Time of the first and the last row [s], on the log's clock.
     facts
         All that was measured.
 
@@ -77,6 +79,8 @@ class Assessment(ShortRepr, BaseModel):
     kind: Kind
     reason: MessageText
     advice: MessageText
+    from_s: float
+    to_s: float
     samples: int
     sample_rate_hz: float
     facts: tuple[LoopFact, ...] = ()
@@ -141,6 +145,8 @@ def assess(log: Samples | Source, *, name: str | None = None, kind: Kind | None 
         kind=kind,
         reason=reason,
         advice=message(f"assess.advice_{key}"),
+        from_s=float(forms.recorded.t[0]),
+        to_s=float(forms.recorded.t[-1]),
         samples=len(log),
         sample_rate_hz=rate,
         facts=measured,

@@ -129,10 +129,8 @@ def read_loops(path: Path, reader: arguments.RecordingReader) -> Iterator[tuple[
     given = reader.columns
     loops = {"": given} if given is not None else find_loops(open_source(path, reader.text).columns)
     loops = {tag: columns.model_copy(update=reader.changes) for tag, columns in loops.items()}
-    first, last = reader.span
     for name, tag, samples in read_tags(path, loops, reader):
-        rows = samples if reader.span == arguments.UNBOUNDED else samples[(samples.t >= first) & (samples.t < last)]
-        yield f"{name}[{tag}]" if len(loops) > 1 else name, rows, "valve" if tag else None
+        yield f"{name}[{tag}]" if len(loops) > 1 else name, samples, "valve" if tag else None
 
 
 def read_tags(
@@ -144,7 +142,7 @@ def read_tags(
     plain = {tag: columns for tag, columns in loops.items() if not columns.segment}
     for tag, columns in loops.items():
         if columns.segment or len(plain) == 1:
-            for name, samples in read_rows(path, columns, reader.where, reader.by).items():
+            for name, samples in read_rows(path, columns, reader.where, reader.by, reader.span).items():
                 yield name, tag, samples
     if len(plain) > 1:
         signals = {
@@ -152,7 +150,7 @@ def read_tags(
         }
         some = next(iter(plain.values()))
         whole = some.model_copy(update={"covariates": {x: x for x in signals}})
-        for name, samples in read_rows(path, whole, reader.where, reader.by).items():
+        for name, samples in read_rows(path, whole, reader.where, reader.by, reader.span).items():
             channels = samples.channels
             for tag, columns in plain.items():
                 u, y = channels[columns.input], channels[str(columns.output)]

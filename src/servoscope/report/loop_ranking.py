@@ -21,20 +21,25 @@ def rank(assessments: Iterable[Assessment]) -> list[Assessment]:
 
 
 def group_by_period(assessments: Sequence[Assessment]) -> list[tuple[Assessment, ...]]:
-    """Return the loops that share a period, the likeliest source first; groups of two and more, the largest first.
+    """Return the loops that share a period at one time, the likeliest source first; the largest group first.
 
     The source is the loop that sticks or is at a limit, and of equals the one that oscillates most regularly: what the
     loops on the way hand on is blurred (Thornhill and Horch, Control Eng. Practice 15, 2007, 1306-1319).
     """
     groups: list[list[Assessment]] = []
     for a in sorted((a for a in assessments if a.value("oscillation")), key=lambda a: a.value("oscillation")):
-        period = a.value("oscillation")
-        if groups and period <= groups[-1][0].value("oscillation") * (1.0 + 2.0 * PERIOD_TOLERANCE):
-            groups[-1].append(a)
+        shared = [group for group in groups if _oscillate_together(group[0], a)]
+        if shared:
+            shared[0].append(a)
         else:
             groups.append([a])
     ranked = [tuple(sorted(group, key=_source_rank, reverse=True)) for group in groups if len(group) > 1]
     return sorted(ranked, key=len, reverse=True)
+
+
+def _oscillate_together(a: Assessment, later: Assessment) -> bool:
+    is_one_period = later.value("oscillation") <= a.value("oscillation") * (1.0 + 2.0 * PERIOD_TOLERANCE)
+    return is_one_period and a.from_s < later.to_s and later.from_s < a.to_s
 
 
 def _source_rank(a: Assessment) -> tuple[bool, float]:

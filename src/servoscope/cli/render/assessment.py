@@ -12,6 +12,7 @@ from servoscope.assessment.assess import Assessment
 from servoscope.cli.render.results import INDENT, print_notes, print_result_table, print_title
 from servoscope.core.messages import say, translate
 from servoscope.report.assessment_page import assessment_size, fact_table, ranking_table
+from servoscope.report.format_values import DASH
 from servoscope.report.loop_ranking import group_by_period
 from servoscope.report.page import ResultTable
 
@@ -31,7 +32,10 @@ def print_assessment(out: Console, a: Assessment) -> None:
 def print_ranking(out: Console, ranked: Sequence[Assessment]) -> None:
     """Print the worst loops first, and which of them oscillate together."""
     table = ranking_table(ranked)
-    rows = [(log, translate(verdict), *others) for log, verdict, *others in table.rows]
+    rows = [
+        (log, DASH if verdict == "nothing conspicuous" else translate(verdict), *others)
+        for log, verdict, *others in table.rows
+    ]
     print_result_table(out, ResultTable(table.head, rows, table.words))
     for group in group_by_period(ranked):
         names = [a.recording for a in group]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -147,14 +148,22 @@ def read_log(path: str | Path, loop: Loop, by: str | None = None) -> Log:
 
 
 def read_rows(
-    source: Source, columns: Columns | None = None, where: Mapping[str, str] | None = None, by: str | None = None
+    source: Source,
+    columns: Columns | None = None,
+    where: Mapping[str, str] | None = None,
+    by: str | None = None,
+    span: tuple[float, float] = (-math.inf, math.inf),
 ) -> dict[str, Samples]:
     """Read rows without judging them, by the recording's name: signals may be constant, and values may be missing.
 
-    Parameters and errors are those of `read_parts`.
+    Of `span`, from and to [s on the recording's clock]. Then dates become seconds since 1970, so that logs can be
+    compared. Other parameters and errors are those of `read_parts`.
     """
-    parts = _read_log(source, None, columns or Columns(), where or {}, by).parts.values()
-    return {part.name: part.samples() for part in parts}
+    log = _read_log(source, None, columns or Columns(), where or {}, by)
+    parts = {part.name: part.samples() for part in log.parts.values()}
+    if span != (-math.inf, math.inf):
+        parts = {name: rows[(rows.t >= span[0]) & (rows.t < span[1])] for name, rows in parts.items()}
+    return {name: replace(rows, t=rows.t + log.origin) if log.origin else rows for name, rows in parts.items()}
 
 
 def read_channels(path: Source, columns: Columns) -> tuple[str, FloatArray, dict[str, FloatArray]]:

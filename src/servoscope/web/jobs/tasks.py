@@ -99,11 +99,11 @@ def assess_file(progress: Progress, file: str, request: requests.InspectionReque
     """Return what one log of a loop shows without a baseline; of several loops of the first."""
     loops = find_loops(open_file(file).columns)
     columns = _merge_columns(request.columns, None) if request.columns is not None else next(iter(loops.values()))
-    ((name, samples),) = readers.read_rows(file, columns, request.where).items()
     first = -math.inf if request.from_s is None else request.from_s
     last = math.inf if request.to_s is None else request.to_s
+    ((name, samples),) = readers.read_rows(file, columns, request.where, span=(first, last)).items()
     progress("assessing")
-    result = assess(samples[(samples.t >= first) & (samples.t < last)], name=name)
+    result = assess(samples, name=name)
     return {"assessment": plain_values.to_plain_values(result)}
 
 
