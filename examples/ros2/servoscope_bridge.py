@@ -5,6 +5,7 @@ python3 servoscope_bridge.py --ros-args -p file:=ros2/ros2.json
 """
 
 import json
+import time
 from pathlib import Path
 
 import rclpy
@@ -29,8 +30,12 @@ class Bridge(Node):
 
     def send(self):
         """Send all diagnostics, and the reports that the fault manager has not yet accepted as they are."""
-        document = json.loads(self.file.read_text(encoding="utf-8"))
-        array = DiagnosticArray(status=[filled(DiagnosticStatus(), fields) for fields in document["status"]])
+        try:
+            document = json.loads(self.file.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            return self.get_logger().warning(f"{self.file}: {error}")
+        stale = {"level": 3, "message": "servoscope does not run"} if time.time() > document["until"] else {}
+        array = DiagnosticArray(status=[filled(DiagnosticStatus(), one | stale) for one in document["status"]])
         array.header.stamp = self.get_clock().now().to_msg()
         self.publisher.publish(array)
         if self.manager is not None and self.manager.service_is_ready():

@@ -47,6 +47,7 @@ def states(row: Row) -> tuple[bool, bool, bool, str]:
     return row["activeState"], row["ackedState"], row["confirmedState"], row["shelvingState"]
 
 
+@pytest.mark.slow
 def test_two_stacks_show_each_state_and_lose_nothing_when_they_come_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

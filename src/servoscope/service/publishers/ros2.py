@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import time
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -25,6 +26,7 @@ FILE = "ros2.json"
 OK, WARN, ERROR = 0, 1, 2  # levels of a DiagnosticStatus
 LEVELS: Mapping[Ne107, int] = {"good": OK, "failure": ERROR}  # all others: the machine goes on
 FAILED, PASSED = 0, 1  # events of a ReportFault
+LOOKS = 3  # for so many the file holds, which is written at each: a service that has ended leaves no healthy machines
 MAX_CODE = 64  # characters of the code of a fault
 Message = dict[str, Any]
 
@@ -60,7 +62,11 @@ class Ros2Publisher(FilesPublisher):
                 ours = {code: old for code, old in self._reports.items() if old["source_id"] == source_id(name)}
                 self._reports |= {code: passed(report) for code, report in ours.items()}
                 self._reports |= {report["fault_code"]: report for report in map(failed, items)}
-        document = {"status": list(self._diagnostics.values()), "reports": list(self._reports.values())}
+        document = {
+            "until": time.time() + LOOKS * self._every_s,
+            "status": list(self._diagnostics.values()),
+            "reports": list(self._reports.values()),
+        }
         return {FILE: json.dumps(document, indent=1, allow_nan=False).encode()}
 
 
