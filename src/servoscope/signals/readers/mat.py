@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import struct
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,9 +15,10 @@ import numpy.typing as npt
 
 from servoscope.core.errors import RecordingError
 from servoscope.signals.readers.matrices import split_matrices
-from servoscope.signals.readers.table import TableFile, one_line_errors
+from servoscope.signals.readers.table import NUMBER_BYTES, TableFile, check_bytes, one_line_errors
 from servoscope.signals.readers.units import split_unit, with_unit
 
+HEADER_BYTES, COMPRESSED, PIECE_BYTES = 128, 15, 1 << 20  # of a MAT file of version 5
 IN_OTHER_FILE = "lies in another file, which is not read: save all data in one file"
 
 
@@ -51,6 +54,7 @@ def _load_mat(path: Path) -> dict[str, Any]:
         with h5py.File(path, "r") as file:
             has_objects = "#subsystem#" in file
     else:
+        _check_unpacked(path)
         loaded = scipy.io.loadmat(path, squeeze_me=False)
         has_objects = any(name == "__function_workspace__" or _is_object(x) for name, x in loaded.items())
     if has_objects:
@@ -58,6 +62,25 @@ def _load_mat(path: Path) -> dict[str, Any]:
             raise ValueError("it holds objects, such as timetables: pip install 'servoscope[formats]'")
         loaded |= _load_objects(path)
     return {n: value for n, value in loaded.items() if not n.startswith(("__", "#")) and not _is_object(value)}
+
+
+def _check_unpacked(path: Path) -> None:
+    """Refuse a MAT file of version 5 whose variables need improbably much memory when unpacked; raises RecordingError.
+
+    Source: MathWorks, "MAT-File Format", level 5: elements of type 15 are compressed by zlib.
+    """
+    total = 0
+    with path.open("rb") as file:
+        order = "<" if file.read(HEADER_BYTES)[-2:] == b"IM" else ">"
+        while len(tag := file.read(8)) == 8:
+            kind, size = struct.unpack(f"{order}II", tag)
+            end = file.tell() + size
+            if kind == COMPRESSED:
+                unpacker, packed = zlib.decompressobj(), b""
+                while not unpacker.eof and (packed := unpacker.unconsumed_tail or file.read(min(PIECE_BYTES, size))):
+                    total += len(unpacker.decompress(packed, PIECE_BYTES))
+                    check_bytes(path, total, "variables")
+            file.seek(end)
 
 
 def _is_object(value: Any) -> bool:
@@ -106,12 +129,14 @@ def _load_hdf5(path: Path, matlab: bool) -> dict[str, Any]:
 def refuse_other_files(path: Path, file: Any) -> None:
     """Refuse an HDF5 file of which a part lies in another file: what is read could be any file of this machine.
 
+    And one whose datasets claim improbably many values.
+
     All that links or references lead to is looked at, before any values are read. A link to a name within the file
     needs no look: what it names has a link of its own, if it is there.
     """
     import h5py
 
-    known: set[int] = set()
+    known, values = set[int](), 0
     waiting: list[tuple[Any, Any]] = [(file, "/")]
     while waiting:
         group, key = waiting.pop()
@@ -125,6 +150,9 @@ def refuse_other_files(path: Path, file: Any) -> None:
         if hash(node.id) in known:
             continue
         known.add(hash(node.id))
+        if isinstance(node, h5py.Dataset):
+            values += (node.size or 0) * max(NUMBER_BYTES, node.dtype.itemsize)
+            check_bytes(path, values, "values")
         references = [node.attrs[name] for name in node.attrs if h5py.check_ref_dtype(node.attrs.get_id(name).dtype)]
         if isinstance(node, h5py.Group):
             waiting += ((node, name) for name in node)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from servoscope.core.errors import RecordingError
-from servoscope.signals.readers.table import CHUNK_ROWS, TableFile, one_line_errors
+from servoscope.signals.readers.table import CHUNK_ROWS, TableFile, check_size, one_line_errors
 from servoscope.signals.readers.units import with_unit
 
 DEFAULT_TIME_NAME = "time"  # of a raster whose clock has no name
@@ -161,6 +161,7 @@ def _open_measurement(
 
     def read_chunks(wanted: Sequence[str], _: Collection[str]) -> Iterator[Mapping[str, Any]]:
         raster = next(raster for raster in rasters if {*wanted} <= {*raster.places})
+        check_size(path, raster.rows, len(wanted))
         with one_line_errors(*damaged), opened() as file:
             for first in range(0, raster.rows, CHUNK_ROWS):
                 rows = min(CHUNK_ROWS, raster.rows - first)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Sequence
 from datetime import date, datetime, time, timedelta
 from pathlib import Path
@@ -13,13 +14,23 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import RecordingError
 from servoscope.signals.readers.clock import is_clock
 from servoscope.signals.readers.layout import HEAD_ROWS, check_names, find_table, table_shape
-from servoscope.signals.readers.table import TableFile, check_width, is_number, one_line_errors, shorten_error
+from servoscope.signals.readers.table import (
+    TableFile,
+    check_bytes,
+    check_width,
+    is_number,
+    one_line_errors,
+    shorten_error,
+)
 
 
 def open_sheet(path: Path) -> TableFile:
     """Open a workbook of Excel or LibreOffice; the first sheet that holds a table of numbers is read."""
     from python_calamine import CalamineWorkbook
 
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            check_bytes(path, sum(member.file_size for member in archive.infolist()), "sheets")
     try:
         with CalamineWorkbook.from_path(str(path)) as book:
             sheets = [book.get_sheet_by_name(name).to_python() for name in book.sheet_names]

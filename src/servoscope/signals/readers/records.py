@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import sqlite3
+import zipfile
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -16,10 +18,19 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.feather as pf
 import pyarrow.json as pj
+from pyarrow.dataset import dataset
 
 from servoscope.core.errors import RecordingError
 from servoscope.signals.readers.matrices import MAX_ARRAY_LENGTH, flatten_table, split_matrices
-from servoscope.signals.readers.table import CHUNK_ROWS, TableFile, check_width, one_line_errors
+from servoscope.signals.readers.table import (
+    CHUNK_ROWS,
+    NUMBER_BYTES,
+    TableFile,
+    check_bytes,
+    check_size,
+    check_width,
+    one_line_errors,
+)
 from servoscope.signals.readers.topics import open_bag
 
 
@@ -49,12 +60,16 @@ def open_feather(path: Path) -> TableFile:
     """Open a Feather file, which is Arrow's own format."""
     kinds = pa.ArrowException, OSError, ValueError
     with one_line_errors(path, "is a damaged Feather file", "write it again", kinds):
+        with suppress(pa.ArrowInvalid, pa.ArrowNotImplementedError):  # version 1 is not packed
+            packed = dataset(path, format="feather")
+            check_size(path, packed.count_rows(), len(packed.schema))
         return _open_frame(path, pf.read_table(path, memory_map=False))
 
 
 def open_numpy(path: Path) -> TableFile:
     """Open arrays of NumPy, ``.npz`` or ``.npy``: columns by name, fields of records, or columns of a matrix."""
     with one_line_errors(path, "holds no plain arrays", "save columns of numbers"), path.open("rb") as file:
+        _check_arrays(path)
         loaded = np.load(file, allow_pickle=False)
         arrays = {"": loaded} if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
     columns = split_matrices(dict(pair for name, array in arrays.items() for pair in _plain_arrays(name, array)))
@@ -63,6 +78,26 @@ def open_numpy(path: Path) -> TableFile:
     )[0]
     others = {name: f"has {x.size} values, not {length}" for name, x in columns.items() if x.size != length}
     return _open_frame(path, pa.table({name: x for name, x in columns.items() if name not in others}), others)
+
+
+def _check_arrays(path: Path) -> None:
+    """Refuse arrays whose headers claim improbably many values; raises RecordingError."""
+
+    def claimed_bytes(file: Any) -> int:
+        version = np.lib.format.read_magic(file)
+        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read_header(file)
+        return math.prod(shape) * max(NUMBER_BYTES, dtype.itemsize)
+
+    if not zipfile.is_zipfile(path):
+        with path.open("rb") as file:
+            return check_bytes(path, claimed_bytes(file), "values")
+    total = 0
+    with zipfile.ZipFile(path) as archive:
+        for name in archive.namelist():
+            with archive.open(name) as member:
+                total += claimed_bytes(member)
+    return check_bytes(path, total, "values")
 
 
 def _plain_arrays(name: str, array: Any) -> Iterator[tuple[str, Any]]:

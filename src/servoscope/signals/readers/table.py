@@ -60,12 +60,21 @@ def check_width(path: Path, count: int) -> None:
 
 def check_size(path: Path, rows: int, columns: int) -> None:
     """Refuse a file whose numbers would need improbably more memory than the file itself; raises RecordingError."""
-    most = max(MIN_UNPACKED_LIMIT_BYTES, MAX_UNPACKED_RATIO * path.stat().st_size)
-    if (size := NUMBER_BYTES * rows * columns) > most:
+    check_bytes(path, NUMBER_BYTES * rows * columns, f"{rows} rows of {columns} columns")
+
+
+def check_bytes(path: Path, size: int, what: str) -> None:
+    """Refuse a file of which `what` it holds needs improbably more memory [B] than the file; raises RecordingError."""
+    if size > (most := unpacked_limit(path)):
         raise RecordingError(
-            f"{path}: claims {rows} rows of {columns} columns, {size / 1e6:.0f} MB, and a file of its size"
+            f"{path}: claims {what}, {size / 1e6:.0f} MB, and a file of its size"
             f" has at most {most / 1e6:.0f} MB: write it in parts"
         )
+
+
+def unpacked_limit(path: Path) -> int:
+    """Return how large a file may be when it is unpacked [B]."""
+    return max(MIN_UNPACKED_LIMIT_BYTES, MAX_UNPACKED_RATIO * path.stat().st_size)
 
 
 def number_column(table: Table, name: str, what: str) -> FloatArray:

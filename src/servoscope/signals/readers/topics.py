@@ -12,10 +12,16 @@ import numpy.typing as npt
 
 from servoscope.core.errors import RecordingError
 from servoscope.signals.readers.matrices import MAX_ARRAY_LENGTH
-from servoscope.signals.readers.table import TableFile, check_width, one_line_errors
+from servoscope.signals.readers.table import (
+    NUMBER_BYTES,
+    TableFile,
+    check_size,
+    check_width,
+    one_line_errors,
+    unpacked_limit,
+)
 
 CONVERT = "convert it to MCAP: ros2 bag convert -i FILE -o OPTIONS.yaml, with storage_id: mcap"
-MAX_VALUES = 200_000_000  # of all topics together, which are held in memory
 
 Topics = Mapping[str, Mapping[str, npt.NDArray[Any]]]
 
@@ -45,15 +51,15 @@ def open_bag(path: Path) -> TableFile:
 def _open_messages(path: Path, messages: Iterable[tuple[str, int, Any]]) -> TableFile:
     """Return the numbers in messages of ROS: topic, time of the log [ns], and the message."""
     rows: dict[str, list[dict[str, float]]] = {}
-    count = 0
+    count, most = 0, unpacked_limit(path)
     for topic, logged, decoded in messages:
         numbers = dict(_message_fields(decoded))
         stamp = [numbers.pop(f"header.stamp.{part}", 0.0) for part in ("sec", "nanosec")]
         seconds = stamp[0] + 1e-9 * stamp[1] if any(stamp) else 1e-9 * logged
         rows.setdefault(topic, []).append({"time": seconds, **numbers})
         count += len(numbers)
-        if count > MAX_VALUES:
-            raise RecordingError(f"{path}: holds more than {MAX_VALUES} values, leave topics out")
+        if NUMBER_BYTES * count > most:
+            check_size(path, count, 1)
     topics = {}
     for topic, row in rows.items():
         names = list(dict.fromkeys(name for fields in row for name in fields))
