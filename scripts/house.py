@@ -86,9 +86,14 @@ class Source:
         return self.text.count("\n")
 
     @cached_property
+    def nodes(self) -> list[ast.AST]:
+        """The nodes of its tree: walking them takes longer than anything that is done with them."""
+        return list(ast.walk(self.tree))
+
+    @cached_property
     def classes(self) -> list[str]:
         """The names of all classes, private and nested ones too."""
-        return [node.name for node in ast.walk(self.tree) if isinstance(node, ast.ClassDef)]
+        return [node.name for node in self.nodes if isinstance(node, ast.ClassDef)]
 
 
 def read(package: Path) -> list[Source]:
@@ -127,19 +132,20 @@ def repeated_modules(sources: Iterable[Source]) -> dict[str, list[Path]]:
     return repeated((source.path.stem, source.path) for source in sources if source.path.stem not in ENTRY)
 
 
-def statements_of(tree: ast.Module) -> int:
+def statements_of(source: Source) -> int:
     """Count the statements, without docstrings."""
     total = 0
-    for node in ast.walk(tree):
+    for node in source.nodes:
         total += isinstance(node, ast.stmt)
         if isinstance(node, ast.Module | ast.ClassDef | FUNCTION):
             total -= ast.get_docstring(node, clean=False) is not None
     return total
 
 
-def function_lengths(tree: ast.Module) -> list[int]:
+def function_lengths(source: Source) -> list[int]:
     """Return the lines of each function, methods and inner functions too, from ``def`` to its last line."""
-    return [(node.end_lineno or node.lineno) - node.lineno + 1 for node in ast.walk(tree) if isinstance(node, FUNCTION)]
+    functions = (node for node in source.nodes if isinstance(node, FUNCTION))
+    return [(node.end_lineno or node.lineno) - node.lineno + 1 for node in functions]
 
 
 def comments_of(text: str) -> tuple[int, int]:
@@ -155,7 +161,9 @@ def comments_of(text: str) -> tuple[int, int]:
 
 
 def code_of(source: Source) -> str:
-    """Return the code, without comments and docstrings."""
+    """Return the code, without comments and docstrings; nothing of a file in which nothing is looked for."""
+    if not any(re.search(pattern, source.text) for pattern in (*KINDS.values(), ARM_QUESTION)):
+        return ""
     bare = ast.parse(source.text)
     for node in ast.walk(bare):
         if isinstance(node, ast.Module | ast.ClassDef | FUNCTION) and ast.get_docstring(node, clean=False) is not None:
@@ -173,7 +181,7 @@ def imported_names(sources: Iterable[Source]) -> set[str]:
     """Return the names of the method that products import."""
     names = set()
     for source in sources:
-        for node in ast.walk(source.tree) if source.path.parts[0] in PRODUCTS else ():
+        for node in source.nodes if source.path.parts[0] in PRODUCTS else ():
             if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[1:2] and not node.level:
                 names |= {alias.name for alias in node.names if str(node.module).split(".")[1] in METHOD}
     return names
@@ -183,7 +191,7 @@ def similar_records(sources: Iterable[Source]) -> list[tuple[str, str]]:
     """Return the pairs of classes whose fields have mostly the same names."""
     fields = {}
     for source in sources:
-        for node in ast.walk(source.tree):
+        for node in source.nodes:
             if isinstance(node, ast.ClassDef):
                 own = {
                     part.target.id
@@ -206,7 +214,7 @@ def measure_reach(sources: list[Source]) -> dict[str, float]:
     modules = set(told["modules"])
     reached = [source for source in sources if ".".join(source.path.with_suffix("").parts) in modules]
     return {
-        "reach": sum(statements_of(source.tree) for source in reached),
+        "reach": sum(statements_of(source) for source in reached),
         "reach_modules": len(reached),
         "callers": max(count for package, count in told["callers"].items() if package in METHOD),
     }
@@ -216,12 +224,12 @@ def measure(sources: list[Source]) -> dict[str, float]:
     """Return the figures."""
     codes = {source.path: code_of(source) for source in sources}
     foreign = [code for path, code in codes.items() if "arm" not in path.parts and "arm" not in path.stem.split("_")]
-    lengths = sorted(length for source in sources for length in function_lengths(source.tree)) or [0]
+    lengths = sorted(length for source in sources for length in function_lengths(source)) or [0]
     comments = [comments_of(source.text) for source in sources]
     return {
         "lines": sum(source.lines for source in sources),
         "nonblank_lines": sum(bool(line.strip()) for source in sources for line in source.text.splitlines()),
-        "statements": sum(statements_of(source.tree) for source in sources),
+        "statements": sum(statements_of(source) for source in sources),
         "files": len(sources),
         "packages": len({source.path.parts[0] for source in sources if len(source.path.parts) > 1}),
         "loose_modules": sum(len(source.path.parts) == 1 and source.path.stem not in ENTRY for source in sources),
