@@ -11,6 +11,8 @@ from threading import Event
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from brokers import until
 from shares import BEGAN, Share, csv, rows
@@ -104,6 +106,16 @@ def test_a_name_that_is_not_utf_8_is_written_out(share: Callable[..., Share]) ->
     press.until(lambda: press.rejections["unreadable"])
     assert "caf\\xe9\\x01.csv" in press.reasons[-1].reason and "\\xe9" in source.asset_troubles["press"].why
     press.reasons[-1].reason.encode()
+
+
+def test_a_nul_in_a_columns_name_is_written_out(share: Callable[..., Share]) -> None:
+    press = share()
+    pq.write_table(
+        pa.table([[1.0], [2.0], [3.0], [4.0]], names=["t", "r", "u", "pos\0ition"]), press.folder / "a.parquet"
+    )
+    source = press.open()
+    press.until(lambda: press.rejections["unreadable"])
+    assert "pos\\x00ition" in press.reasons[-1].reason and "\0" not in source.asset_troubles["press"].why
 
 
 def test_a_slow_file_holds_up_its_own_asset_and_no_other_one(
