@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -66,8 +68,27 @@ def test_an_input_that_is_zero_throughout_is_refused() -> None:
         ss.learn(loop(), [clean(still.t, still.r, 0.0 * still.u, still.y, name="still", sample_rate=RATE)])
 
 
+def test_an_axis_of_inertia_alone_is_learned() -> None:
+    """No term is left: u is inertia times the acceleration."""
+    moved = lively(1)
+    pushed = replace(moved, u=1e3 * np.gradient(np.gradient(moved.y, 1.0 / RATE), 1.0 / RATE))
+    bare = ss.Loop.from_dict({"sample_rate": RATE, "plant": {"kind": "axis", "terms": []}})
+    assert ss.learn(bare, pushed).theta == pytest.approx([1e3], rel=0.05)
+
+
+@pytest.mark.parametrize("factor", [1e100, 1e150])
+def test_numbers_beyond_all_units_are_refused_or_learned(factor: float) -> None:
+    moved = lively(1)
+    with suppress(ServoscopeError):
+        ss.learn(loop(), replace(moved, u=1e9 + moved.u, y=factor * moved.y))  # its regressors have no eigenvalues
+
+
 def test_one_recording_needs_no_list() -> None:
-    assert ss.learn(loop(), lively(1)).sources[0].name == "run 1"
+    moved = lively(1)
+    assert ss.learn(loop(), moved).sources[0].name == "run 1"
+    columns = {"t": moved.t, "r": moved.r, "u": moved.u, "y": moved.y}
+    for given in (columns, [columns], {"cold": [columns]}, {name: [*x.tolist()] for name, x in columns.items()}):
+        assert ss.learn(loop(), given).sources[0].name == "arrays"
 
 
 class TestSlowLoop:

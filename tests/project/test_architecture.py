@@ -23,7 +23,6 @@ HEAVY = ("numba", "scipy", "matplotlib", "pyarrow", "h5py", "pandas", "jinja2")
 LONG, TOO_LONG = 300, 400
 LONG_FUNCTION = 60
 ONE_SUBJECT = {  # files of one subject that is read together
-    "src/servoscope/signals/readers/recording_file.py": 450,
     "benchmarks/hostile/targets.py": 450,
     "tests/diagnosis/test_live.py": 450,
 }

@@ -41,7 +41,7 @@ def find_oscillation(x: FloatArray) -> Oscillation | None:
         return None
     band, faster = band_pass(x, 0.5 * peak, 2.0 * peak), band_pass(x, peak / 3.0, 1.0)  # without what is slower
     rho = signal.correlate(band, band)[x.size - 1 :][: x.size // 2]
-    before = np.flatnonzero(rho[:-1] * rho[1:] < 0.0)[: MAX_INTERVALS + 1]
+    before = np.flatnonzero(np.sign(rho[:-1]) * np.sign(rho[1:]) < 0.0)[: MAX_INTERVALS + 1]
     intervals = np.diff(before + rho[before] / (rho[before] - rho[before + 1]))
     if before.size < MIN_CROSSINGS:
         return None

@@ -26,7 +26,7 @@ from servoscope.learning.plausibility import check_plausibility, check_wraps
 from servoscope.models.loop import Loop
 from servoscope.signals import Recording
 from servoscope.signals.readers import as_recording
-from servoscope.signals.readers.frames import Frame, Source, is_frame
+from servoscope.signals.readers.frames import Frame, Source, is_columns, is_frame
 from servoscope.signals.recording import thin_out
 
 MAX_SAMPLES = 250_000  # of all recordings, that are learned from: more take memory and time, and show little more
@@ -114,7 +114,7 @@ def learn(
     >>> baseline.save("baseline.json")
     """
     loop = Loop.of(loop)
-    if isinstance(recordings, str | Path | Recording) or is_frame(recordings):
+    if isinstance(recordings, str | Path | Recording) or is_frame(recordings) or is_columns(recordings):
         recordings = [recordings]
     given = recordings if isinstance(recordings, Mapping) else {"": recordings}
     named = {name: [as_recording(source, loop) for source in some] for name, some in given.items()}

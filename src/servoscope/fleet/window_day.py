@@ -14,7 +14,7 @@ from servoscope.diagnosis.result import Diagnosis
 from servoscope.fleet.read import read_blocks
 from servoscope.fleet.rows import MICRO, Rows
 from servoscope.machines.protocol import Machine
-from servoscope.signals.readers.recording_file import MIN_EPOCH_S
+from servoscope.signals.readers.logged_rows import MIN_EPOCH_S
 
 MIN_REST = 0.5  # of a window: a shorter rest of a day is no window of its own
 

@@ -139,7 +139,7 @@ def propose_loop(
             return propose_loop(paths, columns, where, kind=kind, is_speed=True)
         chosen, odd = choose_learnable(candidates, loop_of, recordings)
     except (NotEnoughError, RecordingError) as error:
-        raise RecordingError(f"{path}: {error}") from None
+        raise RecordingError(f"{path.name}: {error}") from None
     chosen = with_pressures(chosen, path, columns)
     if odd is not None:
         settings["implausible"] = "note"
@@ -201,7 +201,7 @@ def _read_logs(
     """Return the logs, what `inspect` measures of the first, the cutoffs of all, and what was left out."""
     columns, recording, inspection = _read_evenly(paths[0], columns, where, is_speed)
     if inspection.best_order is None or inspection.suggested_cutoff_hz is None:
-        raise RecordingError(f"{paths[0]}: {inspection.summary}")
+        raise RecordingError(str(inspection.summary))
     monitor = monitor_settings(recording, [inspection.suggested_cutoff_hz])
     plant = {"kind": "polynomial", "order": 1}
     loop = Loop.from_dict({**_settings(recording, columns), "plant": plant, "monitor": monitor})

@@ -159,11 +159,10 @@ class AxisWindow(ChangeWindow):
     def _coefficients(self, factors: dict[str, Any], added: Array) -> Array:
         factors = dict(factors)
         output_gain = factors.pop(SENSOR_GAIN, 1.0)
-        plant = self.plant.scaled(expand_rays(self._rays, factors))
-        assert plant.coefficients is not None
-        coefficients = plant.acceleration_coefficients()
+        moved = self.plant.scaled_coefficients(expand_rays(self._rays, factors))
+        coefficients = self.plant.acceleration_coefficients(moved)
         coefficients = np.where(self._grows_with_y, 1.0, output_gain) * coefficients
-        return np.concatenate([coefficients, output_gain * np.asarray(added) / plant.coefficients["inertia"]])
+        return np.concatenate([coefficients, output_gain * np.asarray(added) / moved["inertia"]])
 
     def _shares(self, profile: ChangeProfile, predictors: int) -> FloatArray:
         """Return how far each set of coefficients is in force, shape (p, N)."""

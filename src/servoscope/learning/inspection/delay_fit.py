@@ -80,7 +80,10 @@ def fit_delay(loop: Loop, recording: Recording, regressors: Regressors | None = 
     if begin is None or loop.hold != "zoh":
         return None
     search = DelaySearch.from_recording(loop, recording, *begin)
-    return search.run() if search is not None else None
+    try:
+        return search.run() if search is not None else None
+    except np.linalg.LinAlgError:  # numbers so large that they have no covariance
+        return None
 
 
 def _initial_plant(loop: Loop, regressors: Regressors | None) -> tuple[Plant, float] | None:

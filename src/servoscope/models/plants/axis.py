@@ -116,6 +116,11 @@ def _columns_of(terms: tuple[TermName, ...]) -> tuple[TermColumn, ...]:
     return (*powers, TermColumn("inertia", 2, 1), *(column for column in columns if column not in powers))
 
 
+@cache
+def _names_of(terms: tuple[TermName, ...]) -> tuple[str, ...]:
+    return tuple(column.coefficient for column in _columns_of(terms))
+
+
 class AxisPlant(TermPlant):
     """Motor axis ``input_gain u = inertia y'' + sum of terms``, each a coefficient times a function of y and y'.
 
@@ -166,6 +171,11 @@ class AxisPlant(TermPlant):
         return _columns_of(self.terms)
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Coefficients of the columns."""
+        return _names_of(self.terms)
+
+    @property
     def derivative(self) -> int:
         """The power of s by which y is ahead of a position."""
         return int(self.y == "speed")
@@ -197,7 +207,7 @@ class AxisPlant(TermPlant):
                 else (y, v)[column]
                 for column in columns
             ]
-        )
+        ).reshape(len(columns), len(y))
 
     @property
     def unwatched(self) -> tuple[str, ...]:
@@ -259,15 +269,13 @@ class AxisPlant(TermPlant):
             return {"inertia": share, "gravity": 1.0, "load_friction": 1.0}
         return super().exponents(parameter)
 
-    def scaled(self, factors: Mapping[str, Any]) -> Self:
-        """Return the same axis with coefficients multiplied; ``input_gain`` multiplies all of them."""
+    def scaled_coefficients(self, factors: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the coefficients multiplied; ``input_gain`` multiplies all of them."""
         mass = factors.get("moved_mass")
-        moved = super().scaled({name: factor for name, factor in factors.items() if name != "moved_mass"})
+        moved = super().scaled_coefficients({name: factor for name, factor in factors.items() if name != "moved_mass"})
         if mass is not None:
-            assert moved.coefficients is not None
-            self._load(
-                moved.coefficients, (mass - 1.0) * self._unit_inertia(self._nominal()) * factors.get("input_gain", 1.0)
-            )
+            inertia = (mass - 1.0) * self._unit_inertia(self._nominal()) * factors.get("input_gain", 1.0)
+            self._load(moved, inertia)
         return moved
 
     def _unit_inertia(self, coefficients: Mapping[str, float]) -> float:
@@ -289,9 +297,11 @@ class AxisPlant(TermPlant):
         if "load_friction" in coefficients:
             coefficients["load_friction"] *= 1.0 + weight / own
 
-    def acceleration_coefficients(self) -> Any:
-        """Return b and all a_i of ``y'' = b u - sum a_i column_i``, in the order of `acting`; they may be complex."""
-        nominal = self._nominal()
-        return (
-            np.array([self.input_gain, *(nominal[column.coefficient] for column in self.acting)]) / nominal["inertia"]
-        )
+    def acceleration_coefficients(self, coefficients: Mapping[str, Any] | None = None) -> Any:
+        """Return b and all a_i of ``y'' = b u - sum a_i column_i``, in the order of `acting`; they may be complex.
+
+        `coefficients`: in the place of the nominal ones.
+        """
+        own = self._nominal() if coefficients is None else coefficients
+        acting = [own[name] for name in self.names if name != "inertia"]
+        return np.array([self.input_gain, *acting]) / own["inertia"]

@@ -124,7 +124,11 @@ class TermPlant(Plant):
         return {name: power for name, power in known.items() if name in self.names}
 
     def scaled(self, factors: Mapping[str, Any]) -> Self:
-        """Return the same plant with what its parameters move; ``input_gain`` multiplies all coefficients.
+        """Return the same plant with what its parameters move."""
+        return self.model_copy(update={"coefficients": self.scaled_coefficients(factors)})
+
+    def scaled_coefficients(self, factors: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the coefficients with what parameters move; ``input_gain`` multiplies all of them.
 
         A factor of the input gain above 1 means that the same motion asks for more u.
         """
@@ -133,7 +137,7 @@ class TermPlant(Plant):
             if parameter != "input_gain":
                 for name, power in self.exponents(parameter).items():
                     moved[name] = moved[name] * (factor if power == 1.0 else factor**power)
-        return self.model_copy(update={"coefficients": moved})
+        return moved
 
     def theta(self) -> FloatArray:
         """Nominal coefficients, shape (n,) [u per output per s^power]."""

@@ -41,6 +41,14 @@ def is_frame(source: object) -> TypeIs[Frame]:
     return hasattr(source, "__arrow_c_stream__") or callable(getattr(source, "collect", None))
 
 
+def is_columns(source: object) -> TypeIs[Mapping[str, npt.ArrayLike]]:
+    """Tell whether something is arrays by name, and not recordings by the name of their operating point."""
+    if not isinstance(source, Mapping) or not source:
+        return False
+    firsts = (values[0] if isinstance(values, list | tuple) and values else values for values in source.values())
+    return all((np.isscalar(x) and not isinstance(x, str)) or isinstance(x, np.ndarray) for x in firsts)
+
+
 def open_source(source: Source, text: TextLayout | None = None) -> TableFile:
     """Open a file, a frame, or a mapping of names to arrays.
 
