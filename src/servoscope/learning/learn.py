@@ -70,25 +70,25 @@ def learn_baseline(
     if not recordings:
         raise NotEnoughError("no recording to learn from: give at least one healthy recording")
     progress("regressors")
-    recordings, left_out = leave_out_defects(loop, recordings)
-    for rec in recordings:
-        check_signals(loop, rec)
-    if loop.columns.covariates or loop.monitor.hidden_warm_up:
-        progress("covariates")
-    healthy = form_healthy_recordings(loop, recordings, population)
-    progress("delay")
-    delay_s, notes = check_delay(healthy.loop, healthy.recordings, accept_delay)
-    name = healthy.loop.monitor.estimator
-    simplified = [
-        message("learning.simplified_estimator", estimator=name, reason=reason)
-        for check, reason in estimators.exceptions(name).items()
-        if check in ("mean", "covariance")
-    ]
-    doubts = [doubt for rec in recordings if (doubt := doubt_healthy(rec)) is not None]
-    off = [defect.description for defect in map(find_switched_off, healthy.recordings) if defect is not None]
-    healthy = replace(healthy, notes=[*left_out, *healthy.notes, *simplified, *notes, *doubts, *off])
-    progress("healthy parameters")
     try:
+        recordings, left_out = leave_out_defects(loop, recordings)
+        for rec in recordings:
+            check_signals(loop, rec)
+        if loop.columns.covariates or loop.monitor.hidden_warm_up:
+            progress("covariates")
+        healthy = form_healthy_recordings(loop, recordings, population)
+        progress("delay")
+        delay_s, notes = check_delay(healthy.loop, healthy.recordings, accept_delay)
+        name = healthy.loop.monitor.estimator
+        simplified = [
+            message("learning.simplified_estimator", estimator=name, reason=reason)
+            for check, reason in estimators.exceptions(name).items()
+            if check in ("mean", "covariance")
+        ]
+        doubts = [doubt for rec in recordings if (doubt := doubt_healthy(rec)) is not None]
+        off = [defect.description for defect in map(find_switched_off, healthy.recordings) if defect is not None]
+        healthy = replace(healthy, notes=[*left_out, *healthy.notes, *simplified, *notes, *doubts, *off])
+        progress("healthy parameters")
         return _assemble_baseline(healthy, learn_plant(healthy), delay_s, progress, earlier)
     except np.linalg.LinAlgError as error:
         names = ", ".join(rec.name for rec in recordings[:3])
