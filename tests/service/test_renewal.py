@@ -67,7 +67,7 @@ def test_a_repair_is_learned_by_a_running_service_and_one_step_leads_back(hall: 
     assert (progress.after, progress.since, progress.revision) == ("repair", t, 1)
     assert 100.0 < progress.learned_s <= progress.needed_s == 200.0
     assert now.learning is not None and now.learning.after == "repair" and now.verdict == "fault"
-    assert now.summary.startswith("Learning after repair, ") and " of 3.3 min. Against the earlier " in now.summary
+    assert " Learning after repair, " in now.summary and " of 3.3 min; until then the earlier " in now.summary
     store.add_audit("otto", "axis", "note", {"t": t, "text": "lighter motor", "anew": False, "kind": "confirmed"})
     confirmed = wait(lambda now: now.learning is not None and now.learning.confirmed)
     assert confirmed.verdict == "undetermined" and "Confirmed as no fault: Fault" in confirmed.summary

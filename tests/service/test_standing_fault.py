@@ -14,11 +14,14 @@ from servoscope.fleet.summary import summarise_fleet
 from servoscope.isolation.candidate import FaultEstimate
 from servoscope.service.alarms import AlarmSettings
 from servoscope.service.assets.asset import Asset, AssetPolicy
+from servoscope.service.assets.condition import asset_condition
 from servoscope.service.assets.examination import StoredDiagnosis, diagnose_blocks, undetermined
 from servoscope.service.assets.examination_schedule import (
+    Announcement,
     ExaminationState,
     PendingDiagnosis,
     accept_diagnosis,
+    restart_after,
     update_examination,
 )
 from servoscope.service.assets.status import AssetStatus
@@ -69,6 +72,32 @@ def test_it_does_not_matter_when_a_full_diagnosis_comes_back() -> None:
     assert accept_diagnosis(examined(due, 25.0, sized), window, named, first=True)[0].sized == 25.0
 
 
+def test_a_later_full_diagnosis_that_is_healthy_withdraws_a_fault() -> None:
+    ill = examined(ExaminationState(due=0.0), 10.0, FAULT)
+    late, early = PendingDiagnosis(1, 0, 20.0, "full"), PendingDiagnosis(1, 0, 5.0, "full")
+    gone, _ = accept_diagnosis(ill, late, HEALTHY, first=True, exceeded=False)
+    assert (gone.verdict, gone.since, gone.onset, gone.fault_at, gone.faults) == ("healthy", 20.0, None, None, [])
+    for window, exceeded in ((late, True), (early, False)):  # the samples still show it, or showed it afterwards
+        assert accept_diagnosis(ill, window, HEALTHY, first=True, exceeded=exceeded)[0].verdict == "fault"
+
+
+def test_after_a_repair_the_samples_since_decide() -> None:
+    friction = FaultEstimate(name="friction", parameter="b", ratio=1.37, interval=(1.3, 1.44))
+    ill = replace(examined(ExaminationState(due=0.0), 10.0, FAULT), faults=[friction.model_dump(mode="json")])
+    assert restart_after(ill, SETTINGS, None) == restart_after(ill, SETTINGS, Announcement("season", 50.0)) == ill
+    mended = restart_after(ill, SETTINGS, Announcement("repair", 50.0))
+    assert restart_after(mended, SETTINGS, Announcement("repair", 50.0)) is mended  # told again after a restart
+    assert (mended.verdict, mended.since, mended.fault_at, mended.faults) == ("undetermined", 50.0, None, [])
+    assert mended.window_begin(60.0, SETTINGS.window_s) == 50.0
+    assert update_examination(mended, SETTINGS, 100.0, True, pytest.fail)[1] is None  # the recursion remembers it
+    resting = examined(mended, 50.0 + SETTINGS.window_s, undetermined("none"))
+    assert resting.due <= 50.0 + 2.0 * SETTINGS.window_s  # and not a period later
+    for ratio, words in ((1.05, "(friction +5 %, within its scatter)"), (1.12, "not quite as before the fault: ")):
+        now = friction.model_copy(update={"ratio": ratio, "interval": (ratio - 0.1, ratio + 0.1)})
+        well = examined(mended, 1000.0, HEALTHY.model_copy(update={"size": now}))
+        assert well.verdict == "healthy" and words in well.summary
+
+
 @pytest.fixture(scope="module")
 def leaky() -> Asset:
     """An asset that has leaked for half a minute, diagnosed in full."""
@@ -99,6 +128,26 @@ def test_when_data_stop_the_fault_is_told_with_its_age(leaky: Asset) -> None:
     # three clocks: the fault, the data, the diagnosis
     assert after.fault_at is not None and BEGAN + 30.0 < after.fault_at <= after.position.t
     assert after.diagnosed is not None and after.diagnosed > after.fault_at - 40.0
+
+
+def test_after_a_repair_a_leak_has_the_size_that_is_left(leaky: Asset) -> None:
+    assert leaky.state is not None
+    begin = leaky.state.position.t + 300.0
+    leaky.announce(Announcement("repair", leaky.state.position.t))
+    status = AssetStatus.model_validate(leaky.status(leaky.state))
+    assert status.verdict == "undetermined" and not status.faults
+    recorded = halls.recorded(3)
+    size = round(0.5 * recorded.sample_rate)
+    for k in range(recorded.samples // size):
+        rows = slice(k * size, (k + 1) * size)
+        t = begin + recorded.t[rows] - recorded.t[0]
+        block = Block("press", 1000 + k, np.asarray(t), recorded.r[rows], recorded.u[rows], recorded.y[rows])
+        assert not any(one.is_new for one in leaky.process(block).transitions if one.alarm == "fault")
+    status = AssetStatus.model_validate(leaky.status(leaky.state))
+    assert status.verdict == "healthy" and status.size is not None and status.size.may_be_healthy
+    assert status.size.ratio == pytest.approx(1.0, abs=0.02)
+    assert "as before the fault (leakage " in status.summary
+    assert "as before the fault (leakage " in asset_condition(status).headline
 
 
 def day(asset: str, date: str, verdict: str) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def test_weeks_with_a_repair_have_no_alarm_but_that_of_the_fault(tmp_path: Path)
         note = {"t": changed.position.t, "text": "motor exchanged", "anew": True, "kind": "repair"}
         store.add_audit("otto", "axis", "note", note)
         learning = follow(3, 21, MOTOR, lambda now: now.learning is not None)
-        assert learning.summary.startswith("Learning after repair, ")
+        assert " Learning after repair, " in learning.summary
         taken = run("relearn", config, "axis", "--why", "motor exchanged", "--yes")
         assert taken.code == 0, taken.err
         renewed = ss.Baseline.load(tmp_path / "axis.axis.json")

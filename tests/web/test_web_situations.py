@@ -151,6 +151,54 @@ SITUATIONS = {
 }
 
 
+# after a fault: at `NOTED` somebody has noted a repair, or a later diagnosis has found nothing
+NOTED = NOW - 200.0
+LEFT = FaultEstimate(name="friction", parameter="b_p", ratio=1.12, interval=(1.06, 1.18))
+BEFORE = FaultEstimate(name="friction", parameter="b_p", ratio=1.37, interval=(1.3, 1.44))
+NOISE = FaultEstimate(name="friction", parameter="b_p", ratio=1.05, interval=(0.97, 1.13))
+WAS, _ = diagnosis(candidate(0.99, BEFORE), checks=(BEARING,))
+RETURNED = {"state": "returned_unacknowledged", "since": NOW, "priority": "high", "cause": WAS.summary, "active": False}
+ACTIVE = RETURNED | {"state": "unacknowledged", "active": True}
+REPAIRED = {
+    "repaired": NOTED,
+    "before": [BEFORE.model_dump(mode="json")],
+    "learning": {"after": "repair", "since": NOTED, "learned_s": 200.0, "needed_s": 600.0},
+}
+LATER = {
+    "repaired": Situation(
+        REPAIRED
+        | {
+            "verdict": "healthy",
+            "summary": "",
+            "since": NOW - 80.0,
+            "sized": NOW,
+            "size": NOISE.model_dump(mode="json"),
+        }
+        | {"alarms": {"fault": RETURNED}},
+        WAS,
+        ("as before the fault (friction +5 %, within its scatter)", "2026-12-23 04:25", "Acknowledge the alarm"),
+    ),
+    "not-quite": Situation(
+        REPAIRED
+        | {"verdict": "fault", "summary": "", "since": NOW - 80.0, "onset": NOTED, "diagnosed": NOW}
+        | {"faults": [LEFT.model_dump(mode="json")], "alarms": {"fault": ACTIVE}},
+        diagnosis(candidate(0.99, LEFT), checks=(BEARING,))[0],
+        ("friction has risen by 12 % since 2026-12-23 04:23:20. Before the repair: friction +37 %", "04:23", BEARING),
+    ),
+    "withdrawn": Situation(
+        {"verdict": "healthy", "summary": "Healthy.", "since": NOW - 80.0, "alarms": {"fault": RETURNED}},
+        WAS,
+        ("No change now; not answered yet: Fault: friction has risen by 37 %", "2026-12-23 04:25", BEARING),
+    ),
+    "learning": Situation(
+        REPAIRED | {"verdict": "undetermined", "summary": "Undetermined.", "since": NOTED, "alarms": {"fault": ACTIVE}},
+        WAS,
+        ("the samples since 2026-12-23 04:23:20 decide whether the fault has gone", "04:23", "move as usual"),
+    ),
+}
+SITUATIONS |= LATER
+
+
 def stored(name: str, situation: Situation) -> dict[str, Any]:
     status = {
         "since": ONSET,
@@ -184,8 +232,16 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     for name, situation in SITUATIONS.items():
         batch.checkpoints[name] = stored(name, situation)
         if situation.full is not None:
-            row = {"asset": name, "number": 1, "t": NOW, "grounds": "full", **situation.full.columns()}
+            t = ONSET + 20.0 if situation.full is WAS else NOW
+            row = {"asset": name, "number": 1, "t": t, "grounds": "full", **situation.full.columns()}
             batch.rows["diagnoses"].append(row)
+    for name, situation in LATER.items():
+        gone = not situation.status["alarms"]["fault"]["active"]
+        for number, t, before, after in ((2, ONSET + 10.0, "normal", "unacknowledged"), (3, NOW - 70.0, "", "")):
+            if number == 2 or gone:
+                states = {"before": before or "unacknowledged", "after": after or "returned_unacknowledged"}
+                row = {"asset": name, "number": number, "t": t, "alarm": "fault", **states, "cause": "", "who": ""}
+                batch.rows["transitions"].append(row | {"document": {"event": "occur" if number == 2 else "clear"}})
     for number, (ago, alarm, before, after, event, who) in enumerate(STEPS, start=10):
         row = {"asset": "step", "number": number, "t": NOW - ago, "alarm": alarm, "before": before, "after": after}
         batch.rows["transitions"].append(row | {"cause": "", "who": who, "document": {"event": event}})
@@ -223,6 +279,39 @@ def test_the_first_screen_says_what_since_when_and_what_to_do(page: Any, address
             assert box["y"] + box["height"] <= height, (words, width)
         assert not re.search(r"T²|CUSUM|σ|iFRF|_friction", verdict.inner_text())
     accessible(page)
+
+
+@pytest.mark.parametrize("name", LATER)
+def test_after_a_fault_every_view_says_the_same(page: Any, address: str, tmp_path: Path, name: str) -> None:
+    what, _, _ = LATER[name].expected
+    asset = asked(address, f"/assets/{name}")
+    row = next(row for row in asked(address, "/assets")["assets"] if row["asset"] == name)
+    said = what.replace("2026-12-23 04:23:20", "2026-12-23 04:23:20 UTC")  # nobody has said where the reader is
+    headline = asset["sections"][0]["title"]
+    assert said in headline and said in row["summary"]
+    alarm = next(one for one in asked(address, "/alarms")["alarms"] if one["asset"] == name)
+    is_fault = asset["verdict"] == "fault"
+    assert alarm["active"] == (name in ("not-quite", "learning"))
+    assert (alarm["since"], said in alarm["cause"]) == ((NOTED, True) if is_fault else (NOW, False))
+    assert [size["ratio"] for size in asset["sizes"]] == ([1.12] if is_fault else [])
+    page.set_viewport_size({"width": 1280, "height": 844})
+    page.goto(f"{address}/assets/{name}")
+    label = "What has happened to this asset over time"
+    page.get_by_label(f"View and save: {label}").click()
+    with page.expect_download() as download:
+        page.get_by_role("button", name=f"Save the values: {label}").click()
+    download.value.save_as(tmp_path / "timeline.csv")
+    with (tmp_path / "timeline.csv").open(encoding="utf-8", newline="") as file:
+        bars = [
+            (_seconds_ago(row["from"]), _seconds_ago(row["to"]))
+            for row in csv.DictReader(file)
+            if row["what"] == "Fault"
+        ]
+    began = NOW - (NOTED if is_fault else ONSET)
+    assert bars == [(began, 0.0 if alarm["active"] else 70.0)]
+    page.goto(f"{address}/alarms?asset={name}")
+    listed = page.get_by_role("table").first
+    playwright.expect(listed).to_contain_text(what if is_fault else "friction has risen by 37 %")
 
 
 def test_a_timeline_shows_what_has_happened(page: Any, address: str, tmp_path: Path) -> None:
@@ -267,14 +356,16 @@ def _seconds_ago(date: str) -> float | None:
 
 def test_alarm_and_diagnosis_lead_to_each_other_and_several_are_answered_at_once(page: Any, address: str) -> None:
     page.goto(f"{address}/alarms")
-    page.get_by_role("link", name="reasons").click()
+    page.get_by_role("row").filter(has=page.get_by_role("link", name="gone", exact=True)).get_by_role(
+        "link", name="reasons"
+    ).click()
     playwright.expect(page.get_by_role("heading", level=1)).to_have_text("Diagnosis of gone")
     page.get_by_role("link", name="Its alarms").click()
     rows = page.get_by_role("table").first.get_by_role("row")
     playwright.expect(rows).to_have_count(1 + 1)
     page.get_by_label("Search alarms").fill("")
-    playwright.expect(rows).to_have_count(1 + 2)
-    page.get_by_role("button", name="Acknowledge these 2").click()
+    playwright.expect(rows).to_have_count(1 + 2 + len(LATER))
+    page.get_by_role("button", name="Acknowledge these 6").click()
     playwright.expect(page.get_by_text("Asked for: the service carries it out")).to_be_visible()
 
 
@@ -295,8 +386,8 @@ def test_a_fleet_without_assets_leads_to_the_first_one(page: Any, tmp_path: Path
 def test_a_phone_shows_machines_first(page: Any, address: str) -> None:
     page.set_viewport_size({"width": 390, "height": 844})
     page.goto(address)
-    first = page.get_by_role("row").filter(has=page.get_by_role("link", name="drift", exact=True))
-    playwright.expect(first).to_contain_text("× 4.04: friction")
+    first = page.get_by_role("row").filter(has=page.get_by_role("link", name="not-quite", exact=True))
+    playwright.expect(first).to_contain_text("+12 %: friction")
     assert first.bounding_box()["y"] < 250.0
     playwright.expect(page.get_by_label("Order")).to_be_hidden()
     page.get_by_role("button", name="Filters and map").click()

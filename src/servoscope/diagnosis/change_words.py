@@ -44,6 +44,23 @@ def change_messages(faults: Sequence[FaultEstimate]) -> tuple[Message, ...]:
     return tuple(map(_change_message, faults))
 
 
+def relative_changes(faults: Sequence[FaultEstimate]) -> tuple[Message, ...]:
+    """Return how far each fault is from healthy: ``friction +5 %``."""
+    return tuple(
+        message("change.relative", name=quantity_name(fault), percent=100.0 * (fault.ratio - 1.0)) for fault in faults
+    )
+
+
+def after_repair(before: Sequence[FaultEstimate], now: FaultEstimate | None) -> Message:
+    """Return what is left of faults that were repaired, of a machine that is healthy; `now`: its size, if known."""
+    if now is None or [now.name] != [fault.name for fault in before]:
+        return message("service.examination.as_before", sizes=None)
+    changes = relative_changes((now,))
+    if not now.may_be_healthy:
+        return message("service.examination.not_quite", changes=changes)
+    return message("service.examination.as_before", sizes=message("service.examination.scatter", changes=changes))
+
+
 def fault_label(name: str) -> str:
     """Return the name of a fault as every view shows it."""
     return name.replace("_", " ")

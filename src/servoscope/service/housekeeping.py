@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from servoscope.core.errors import AlarmError, ServoscopeError, StoreUnavailableError
 from servoscope.core.messages import message, render
 from servoscope.service.alarms import LifecycleEvent, OperatorCommand
+from servoscope.service.assets.examination_schedule import Announcement
 from servoscope.service.assets.records import StepResult, audit_row
-from servoscope.service.assets.status import Announcement
 from servoscope.service.baselines import export_baseline, stored_baseline
 from servoscope.service.config import StoreSettings
 from servoscope.service.log import log

@@ -14,10 +14,10 @@ from servoscope.diagnosis.change_words import fault_label
 from servoscope.diagnosis.checks import suspects
 from servoscope.machines.kinds import load_cached
 from servoscope.machines.protocol import Machine
+from servoscope.service.assets.condition import asset_condition
 from servoscope.service.assets.status import AssetStatus
 from servoscope.service.store import Row, tables
 from servoscope.service.store.series import read_checks
-from servoscope.web.asset_document import has_open_fault
 from servoscope.web.dependencies import Context
 from servoscope.web.routes.baselines import asset_baseline_id, find_baseline
 from servoscope.web.schemas.responses import FaultCheck
@@ -34,7 +34,7 @@ def last_full_diagnosis(context: Context, asset: str) -> Row | None:
 
 def asset_checks(context: Context, asset: str, status: AssetStatus, row: Row | None) -> list[FaultCheck]:
     """Return what to check, by fault; `row`: its last full diagnosis. Nothing without a fault that is open."""
-    if not has_open_fault(status):
+    if not asset_condition(status).is_open:
         return []
     diagnosis = read_diagnosis(row["document"]) if row is not None else None
     names = [fault.name for fault in status.faults] or (suspects(diagnosis.current) if diagnosis is not None else ())

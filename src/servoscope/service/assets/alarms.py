@@ -21,10 +21,10 @@ from servoscope.service.alarms import (
     step_alarm,
 )
 from servoscope.service.assets.checkpoint import AssetState, evolve
-from servoscope.service.assets.examination_schedule import ExaminationState
+from servoscope.service.assets.examination_schedule import Announcement, ExaminationState
 from servoscope.service.assets.outlook import OutlookWord, current_outlook
 from servoscope.service.assets.reception import Reception
-from servoscope.service.assets.status import Announcement, asset_snapshot
+from servoscope.service.assets.status import asset_snapshot
 from servoscope.signals import quality
 
 

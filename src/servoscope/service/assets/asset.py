@@ -11,7 +11,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from servoscope.core.errors import StateError
 from servoscope.core.messages import message, render
 from servoscope.diagnosis.schedule import DiagnosisSchedule
 from servoscope.machines.kinds import MachineSource, to_machine
@@ -19,9 +18,10 @@ from servoscope.prognosis.forecast import Prognosis
 from servoscope.service.alarms import AlarmSettings, AlarmTransition, OperatorCommand
 from servoscope.service.assets.alarms import AssetAlarms
 from servoscope.service.assets.block_lanes import BlockLanes, Followed
-from servoscope.service.assets.checkpoint import AssetState, StreamPosition, evolve
+from servoscope.service.assets.checkpoint import AssetState, StreamPosition, check_machine, evolve
 from servoscope.service.assets.examination import StoredDiagnosis, carry_covariates, examine_blocks
 from servoscope.service.assets.examination_schedule import (
+    Announcement,
     ExaminationState,
     PendingDiagnosis,
     accept_diagnosis,
@@ -29,6 +29,7 @@ from servoscope.service.assets.examination_schedule import (
     fault_names,
     is_at_rest,
     rest_period,
+    restart_after,
     schedule_full_diagnosis,
     update_examination,
 )
@@ -49,7 +50,7 @@ from servoscope.service.assets.records import (
     transition_row,
 )
 from servoscope.service.assets.states import AssetStates, StateHolder
-from servoscope.service.assets.status import Announcement, asset_metadata, asset_status, checks_of_named
+from servoscope.service.assets.status import asset_metadata, asset_status, checks_of_named
 from servoscope.service.clock import LayerTimes
 from servoscope.service.config import DiagnosisSettings
 from servoscope.service.sources.block import Block
@@ -121,7 +122,8 @@ class Asset(StateHolder):
     def announce(self, announced: Announcement | None) -> None:
         """Let it learn again after what was done to it; None: it has learned."""
         if announced != self.alarms.announced and self._state is not None:
-            self.take_state()
+            state = self.take_state()
+            self.state = replace(state, examination=restart_after(state.examination, self.policy.diagnosis, announced))
         self.alarms.announced = announced
 
     def compile_kernels(self) -> None:
@@ -137,12 +139,7 @@ class Asset(StateHolder):
         Returns those that were counted after the checkpoint, for `process`: they lead to nothing but the state after
         them. Raises StateError if it belongs to another baseline or layout.
         """
-        other = "belongs to another baseline" if state.baseline != self.machine.hash else "is of another servoscope"
-        if state.baseline != self.machine.hash or state.monitor.shape != self.monitor.init().shape:
-            raise StateError(
-                f"{self.name}: its saved state {other} ({state.baseline}, now {self.machine.hash}): "
-                f"run --anew {self.name} begins with a new state, behind the samples counted"
-            )
+        check_machine(state, self.name, self.machine.hash, self.monitor.init().shape)
         t = state.position.t
         alarms = self.alarms.begin(self.name, t, state.alarms)
         self.state = replace(state, alarms=alarms, quality=quality.restart_silence(state.quality, t))
@@ -313,8 +310,8 @@ class Asset(StateHolder):
         state = self.take_state()
         if window not in state.pending_diagnoses:
             return StepResult([], [])
-        first = self._is_first_diagnosis(window)
-        examination, diagnosis = accept_diagnosis(state.examination, window, diagnosis, first=first)
+        known = {"first": self._is_first_diagnosis(window), "exceeded": state.evaluation.exceeded}
+        examination, diagnosis = accept_diagnosis(state.examination, window, diagnosis, **known)
         pending = tuple(waiting for waiting in state.pending_diagnoses if waiting != window)
         self.state = replace(state, examination=examination, pending_diagnoses=pending)
         self._window.trim(state.position.t, pending)
@@ -360,10 +357,15 @@ class Asset(StateHolder):
         """Examine the last minutes if that is due, and request a full diagnosis of a new fault."""
         state, settings = self.take_state(), self.policy.diagnosis
         t, known = state.position.t, state.examination
-        details = state.evaluation.features, single_fault(known.faults), known.verdict, self.alarms.assesses
+        details = (
+            state.evaluation.features,
+            single_fault(known.faults or known.before),
+            known.verdict,
+            self.alarms.assesses,
+        )
         if is_at_rest(known, t, state.evaluation.exceeded):
             return
-        recent = partial(self._window.after, t - settings.window_s)
+        recent = partial(self._window.after, known.window_begin(t, settings.window_s))
         examination, result = update_examination(
             state.examination,
             settings,

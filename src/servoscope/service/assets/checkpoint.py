@@ -94,6 +94,16 @@ class AssetState:
         return {name: evolve(alarm, at=self.alarms_at) for name, alarm in self.alarms.items()}
 
 
+def check_machine(state: AssetState, name: str, baseline: str, layout: tuple[int, ...]) -> None:
+    """Raise StateError unless a state is of a machine with this baseline and of this layout of the monitor's state."""
+    other = "belongs to another baseline" if state.baseline != baseline else "is of another servoscope"
+    if state.baseline != baseline or state.monitor.shape != layout:
+        raise StateError(
+            f"{name}: its saved state {other} ({state.baseline}, now {baseline}): "
+            f"run --anew {name} begins with a new state, behind the samples counted"
+        )
+
+
 def pack_state(state: AssetState) -> bytes:
     """Return a state as bytes, with version and digest."""
     at = {} if state.alarms_at is None else {"at": state.alarms_at}

@@ -121,13 +121,14 @@ def examine_blocks(
         if changed:
             headline = message("service.examination.features", excess=features)
             return StoredDiagnosis(verdict="fault", headline=headline, onset=None)
+        size = _follow_size(exam, fault, 0) if fault is not None else None
         if known is not None:
             verdict, headline, _ = judge_without_alarm(exam)
             if verdict == known:
-                return StoredDiagnosis(verdict=verdict, headline=headline)
+                return StoredDiagnosis(verdict=verdict, headline=headline, size=size if verdict == "healthy" else None)
         diagnosis, _ = diagnose_examination(exam)
-        document = diagnosis.model_dump(mode="json")
-        return StoredDiagnosis(verdict=diagnosis.verdict, headline=diagnosis.headline, document=document)
+        document, size = diagnosis.model_dump(mode="json"), size if diagnosis.verdict == "healthy" else None
+        return StoredDiagnosis(verdict=diagnosis.verdict, headline=diagnosis.headline, document=document, size=size)
     if not exam.alarm[-1]:
         return undetermined("recovering").model_copy(update={"recovering": True})
     first = 0 if exam.alarm.all() else len(exam.alarm) - int(np.argmin(exam.alarm[::-1]))
@@ -164,7 +165,8 @@ def compile_examination(baseline: Baseline) -> None:
 def _follow_size(exam: Examination, fault: str, first: int) -> FaultEstimate | None:
     """Return the size of a fault at the end of the window, by the recursion; the alarm began at evaluation `first`.
 
-    None where the coefficients are not where this fault alone would have moved them: then it has no size.
+    None where the coefficients are not where this fault alone would have moved them: then it has no size. A size that
+    may be healthy is one as long as there is no alarm.
     """
     from servoscope.detection.onset import Onset
     from servoscope.diagnosis.batch_estimate import isolation_inputs
@@ -176,9 +178,10 @@ def _follow_size(exam: Examination, fault: str, first: int) -> FaultEstimate | N
     try:
         signatures, deviation, covariance = isolation_inputs(exam, onset, exam.evaluations - 1)
         own = [signature for signature in signatures if signature.fault.name == fault]
-        best = isolate(own, deviation, covariance)[0]
+        candidates = isolate(own, deviation, covariance)
     except (ServoscopeError, np.linalg.LinAlgError, ArithmeticError):
         return None
+    best = candidates[0] if exam.alarm.any() else next((one for one in candidates if one.faults), candidates[0])
     return best.faults[0] if best.name == fault else None
 
 

@@ -11,20 +11,33 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
+from servoscope.baseline.records import RENEWALS, Occasion
 from servoscope.core.messages import message, render
 from servoscope.core.verdict import VerdictKind
+from servoscope.diagnosis.change_words import after_repair
 from servoscope.diagnosis.schedule import DiagnosisSchedule
+from servoscope.isolation.candidate import FaultEstimate
 from servoscope.service.assets.examination import StoredDiagnosis
 from servoscope.service.config import DiagnosisSettings
 
 FIRST_RETRY_S = 1.0  # until a disagreement is examined for the second time
 # of the assets of a process that begin together: 3 % of a core at 3 ms each, beside samples that may need all the rest
 FIRST_PER_S = 10.0
+# of a fault, once it has gone
+GONE: dict[str, Any] = {"onset": None, "faults": [], "fault_at": None, "diagnosed": None, "size": {}, "sized": None}
 DAY_S = 86400.0  # between two full diagnoses of a fault that lasts, at most
+
+
+class Announcement(NamedTuple):
+    """What was done to an asset, after which its baseline is learned again."""
+
+    after: Occasion
+    since: float  # [UTC s]
+    confirmed: bool = False  # whether somebody has said that what has changed since is no fault
 
 
 @dataclass(frozen=True)
@@ -60,6 +73,21 @@ class ExaminationState:
     size: dict[str, Any] = field(default_factory=dict)
     sized: float | None = None
     control: str | None = None  # what the samples show by themselves, "" for nothing; None: not assessed
+    # repaired, before: when something was done to the machine, before which no sample is examined [UTC s], and the
+    # faults that were known then
+    repaired: float | None = None
+    before: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def newest_faults(self) -> list[dict[str, Any]]:
+        """Its faults with their newest sizes."""
+        known = [fault["name"] for fault in self.faults]
+        is_newer = bool(self.size) and known == [self.size["name"]] and (self.sized or 0.0) >= (self.diagnosed or 0.0)
+        return [self.size] if is_newer else self.faults
+
+    def window_begin(self, t: float, window_s: float) -> float:
+        """Return from when on samples are examined at `t` [UTC s]."""
+        return max(t - window_s, -math.inf if self.repaired is None else self.repaired)
 
     @classmethod
     def begin(cls, t: float, settings: DiagnosisSettings, phase: float, assets: int = 1) -> ExaminationState:
@@ -124,16 +152,16 @@ def update_examination(
     every = settings.every_s
     # the asset's own next turn, half a period away at least
     due = every * (math.floor((t + every / 2.0) / every - phase) + 1.0 + phase)
-    if result.recovering:
-        due = min(due, t + settings.window_s)
     # nothing to be seen, of a machine that is off for example, is no repair
     faulty, unseen = result.verdict == "fault", result.verdict == "undetermined" and not result.recovering
     stands = unseen and state.fault_at is not None
+    if result.recovering or stands or (unseen and state.repaired is not None):  # somebody waits for the answer
+        due = min(due, t + settings.window_s)
     new = replace(
         state,
         due=due,
         verdict=result.verdict,
-        summary=result.summary,
+        summary=_summary(result, state.before),
         since=state.since if unchanged else t,
         # the onset has left a window that is above its limits throughout; an earlier examination has found it
         onset=state.onset if (unchanged or stands) and state.onset is not None else result.onset,
@@ -149,6 +177,12 @@ def update_examination(
     return new, result
 
 
+def _summary(result: StoredDiagnosis, before: Sequence[Mapping[str, Any]]) -> str:
+    if result.verdict != "healthy" or not before:
+        return result.summary
+    return render(after_repair([FaultEstimate.model_validate(fault) for fault in before], result.size))
+
+
 def schedule_full_diagnosis(
     state: ExaminationState, schedule: DiagnosisSchedule, t: float
 ) -> tuple[ExaminationState, bool]:
@@ -158,10 +192,41 @@ def schedule_full_diagnosis(
     return replace(state, again=schedule.next_alarm(state.since, t, DAY_S)), True
 
 
+def restart_after(
+    state: ExaminationState, settings: DiagnosisSettings, announced: Announcement | None
+) -> ExaminationState:
+    """Return the state after what was done to the machine: its fault is past, and the samples since decide."""
+    if announced is None or announced.after not in RENEWALS or announced.since <= (state.repaired or -math.inf):
+        return state
+    since = announced.since
+    due = since + settings.window_s
+    return replace(
+        state,
+        due=due,
+        retry=due,
+        doubts=0,
+        verdict="undetermined",
+        summary=render(message("service.examination.repaired", t=since)),
+        since=since,
+        **GONE,
+        repaired=since,
+        before=state.newest_faults if announced.after == "repair" else [],
+    )
+
+
 def accept_diagnosis(
-    examination: ExaminationState, window: PendingDiagnosis, diagnosis: StoredDiagnosis, *, first: bool
+    examination: ExaminationState,
+    window: PendingDiagnosis,
+    diagnosis: StoredDiagnosis,
+    *,
+    first: bool,
+    exceeded: bool = True,
 ) -> tuple[ExaminationState, StoredDiagnosis]:
-    """Return the state with a full diagnosis, and that with the onset that is known; `first`: of this fault."""
+    """Return the state with a full diagnosis, and that with the onset that is known.
+
+    `first`: whether it is the first of this fault; `exceeded`: whether the recursion is above a limit now. If it is
+    not, a later window that is healthy withdraws the fault.
+    """
     if not first:
         diagnosis = diagnosis.with_onset(examination.onset)
     # not of a fault before this one; a later window that names nothing keeps the name
@@ -181,6 +246,8 @@ def accept_diagnosis(
     elif diagnosis.verdict == "undetermined" and not examination.named:
         # a sensor that is stuck, for example: nothing that would stand was found
         examination = replace(examination, fault_at=None)
+    elif diagnosis.verdict == "healthy" and not exceeded and window.until > (examination.fault_at or math.inf):
+        examination = replace(examination, verdict="healthy", summary=diagnosis.summary, since=window.until, **GONE)
     return examination, diagnosis
 
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -25,7 +25,7 @@ from servoscope.service.alarms import (
     evaluate_ne107,
 )
 from servoscope.service.assets.checkpoint import AssetState, StreamPosition
-from servoscope.service.assets.examination_schedule import ExaminationState
+from servoscope.service.assets.examination_schedule import Announcement, ExaminationState
 from servoscope.service.assets.outlook import Outlook, OutlookWord, current_outlook
 from servoscope.service.assets.reception import RECEPTION_OK, Reception, ReceptionState
 from servoscope.service.assets.residual_history import EvaluationStatus
@@ -48,14 +48,6 @@ class AlarmStatus(_StatusRecord):
     until: float | None = None  # end of its shelving [UTC s]
     active: bool | None = None  # whether its condition is abnormal, whatever the state; None: of a version before 2.0
     ne107: Ne107 | None = None  # status that it gives to its asset
-
-
-class Announcement(NamedTuple):
-    """What was done to an asset, after which its baseline is learned again."""
-
-    after: Occasion
-    since: float  # [UTC s]
-    confirmed: bool = False  # whether somebody has said that what has changed since is no fault
 
 
 class LearningStatus(_StatusRecord):
@@ -117,6 +109,9 @@ class AssetStatus(AssetVerdict, EvaluationStatus):
     fault_at: float | None = None
     diagnosed: float | None = None
     size: FaultEstimate | None = None  # of the fault by the newest examination, at `sized`
+    # repaired, before: when something was done to it [UTC s], before which no sample counts, and its faults until then
+    repaired: float | None = None
+    before: tuple[FaultEstimate, ...] = ()
     outlook: Outlook | None = None  # when the fault reaches its limit; None: it has none, or nothing is known yet
     position: StreamPosition = Field(alias="counted")
     metadata: AssetMetadata = Field(AssetMetadata(), alias="about")
@@ -279,6 +274,7 @@ def asset_status(
         **({} if reception == RECEPTION_OK else {"reception": reception.state}),
         **({} if examination.fault_at is None else {"fault_at": examination.fault_at}),
         **({} if examination.diagnosed is None else {"diagnosed": examination.diagnosed}),
+        **({} if examination.repaired is None else {"repaired": examination.repaired, "before": examination.before}),
         **({} if outlook is None else {"outlook": outlook.model_dump(mode="json", exclude_unset=True)}),
         "counted": vars(state.position),
         "about": metadata,

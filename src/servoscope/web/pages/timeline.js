@@ -36,7 +36,7 @@ export function timeline(path, asset, signal) {
 }
 
 // From when until when each alarm was there; a fault begins at the onset that its diagnoses found.
-function bars(transitions, { onset, verdict }, diagnoses) {
+function bars(transitions, { onset, since, verdict }, diagnoses) {
   const open = new Map();
   const ended = [];
   for (const { t, alarm, after, cause } of transitions) {
@@ -51,9 +51,9 @@ function bars(transitions, { onset, verdict }, diagnoses) {
   const found = [...ended, ...open.values()];
   for (const bar of found.filter((one) => one.row === "Fault")) {
     const onsets = diagnoses.filter((one) => one.onset !== null && one.t >= bar.from && (bar.to === null || one.t <= bar.to)).map((one) => one.onset);
-    if (bar.to === null && verdict === "fault" && onset !== null) onsets.push(onset);
+    const known = bar.to === null && verdict === "fault" ? (onset ?? since) : null; // as the headline says
     const before = Math.max(...found.filter((one) => one.row === "Fault" && one.to !== null && one.to < bar.from).map((one) => one.to));
-    bar.from = Math.max(Math.min(bar.from, ...onsets), before);
+    bar.from = Math.max(known ?? Math.min(bar.from, ...onsets), before);
   }
   return found;
 }

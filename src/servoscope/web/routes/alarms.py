@@ -30,7 +30,7 @@ def list_alarms(context: ContextDep, query: Annotated[AssetQuery, Query()]) -> s
     """List the alarms that are not normal, the most urgent first."""
     mark = context.event_hub.mark
     statuses = read_statuses(context.store, query.assets or None)
-    rows = [row for stored in statuses.values() for row in schemas.alarm_rows(stored.name, stored.status.alarms)]
+    rows = [row for stored in statuses.values() for row in schemas.status_alarms(stored.name, stored.status)]
     rows.sort(key=lambda row: (not row.unacknowledged, -row.rank, -row.since, row.asset, row.alarm))
     floods = (status.flood for _, status in service_statuses(statuses.values()))
     return schemas.AlarmList(
@@ -42,16 +42,14 @@ def list_alarms(context: ContextDep, query: Annotated[AssetQuery, Query()]) -> s
 
 
 def _with_advice(context: Context, row: schemas.AlarmRow, status: AssetStatus | ServiceStatus) -> schemas.AlarmDetail:
-    """Return an alarm with what the service file says of it; of a fault with what to check, and since when."""
+    """Return an alarm with what the service file says of it; of a fault with what to check."""
     definition = context.config.alarms.definitions.get(alarm_kind(row.alarm)) if context.config is not None else None
     known, checks = dict(row), list[FaultCheck]()
     full = last_full_diagnosis(context, row.asset) if row.alarm == FAULT_ALARM else None
     if row.alarm == FAULT_ALARM and isinstance(status, AssetStatus):
         checks = asset_checks(context, row.asset, status, full)
-        if full is not None:
+        if full is not None and status.verdict != "fault":
             known["cause"] = stored_headline(full)
-        if status.verdict == "fault":  # its alarm's state is younger once somebody has answered
-            known["since"] = status.onset if status.onset is not None else status.since
     return schemas.AlarmDetail(
         **known,
         consequence=definition.consequence if definition is not None else None,

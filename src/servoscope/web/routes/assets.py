@@ -18,13 +18,13 @@ from servoscope.machines.kinds import load_cached
 from servoscope.prognosis.forecast import prognose
 from servoscope.report.downsample import signal_columns
 from servoscope.service.asset_link import page_address, qr_code
+from servoscope.service.assets.condition import asset_condition
 from servoscope.service.assets.status import AssetStatus
 from servoscope.service.sources.block import Block
 from servoscope.service.store import Store
 from servoscope.service.store.queries import query_downsampled, query_history
 from servoscope.service.store.rows import CHECKS, NOTE
 from servoscope.service.store.series import FAULT_KINDS, query_sizes, read_notes, read_series, thin_columns
-from servoscope.web.asset_document import has_open_fault
 from servoscope.web.checks import asset_checks, asset_machine, fault_checks, last_full_diagnosis
 from servoscope.web.dependencies import VIEWER, Context, ContextDep, Operator
 from servoscope.web.routes.baselines import asset_baseline_id, find_baseline, load_loop_baseline
@@ -69,7 +69,7 @@ KnownAsset = Annotated[str, Depends(require_asset)]
 
 def build_asset_detail(context: Context, asset: str, at: float, status: AssetStatus) -> schemas.AssetDetail:
     """Return all that is known of an asset now."""
-    row = last_full_diagnosis(context, asset) if has_open_fault(status) else None
+    row = last_full_diagnosis(context, asset) if asset_condition(status).is_open else None
     checks = asset_checks(context, asset, status, row)
     baseline = asset_baseline_id(context, asset)
     return schemas.AssetDetail.build(asset, at, status, baseline=baseline, row=row, checks=checks)

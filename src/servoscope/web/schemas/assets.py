@@ -14,11 +14,12 @@ from pydantic import Field
 from servoscope.estimation.frequency_response import CHI2_95_2DOF, ResponseRow
 from servoscope.prognosis.series import NORMAL_95
 from servoscope.report.document import to_json
-from servoscope.service.alarms import TRANSITION_TABLE, LifecycleEvent, LifecycleState
+from servoscope.service.alarms import FAULT_ALARM, TRANSITION_TABLE, LifecycleEvent, LifecycleState
 from servoscope.service.alarms.records import UNACKNOWLEDGED_STATES
+from servoscope.service.assets.condition import asset_condition
 from servoscope.service.assets.outlook import Outlook
 from servoscope.service.assets.status import AlarmStatus, AssetStatus, AssetVerdict, FloodCounts, ServiceStatus
-from servoscope.web.asset_document import asset_document, status_headline
+from servoscope.web.asset_document import asset_document
 from servoscope.web.schemas.requests import CommandName
 from servoscope.web.schemas.responses import (
     ApiResponse,
@@ -145,17 +146,18 @@ class AssetRow(AssetVerdict, ApiResponse):
     @classmethod
     def from_status(cls, name: str, at: float, status: AssetStatus) -> AssetRow:
         """Return the row of an asset whose status was stored at a time [UTC s]."""
-        alarms = alarm_rows(name, status.alarms)
+        condition = asset_condition(status)
+        alarms = status_alarms(name, status)
         derived = {
             "asset": name,
-            "summary": status_headline(status),
+            "summary": condition.headline,
             "group": status.metadata.group,
             "source": status.metadata.source,
             "quality": list(status.quality),
             "deviation": relative_residual(status),
             "alarms": alarms,
             "sizes": fault_sizes(status),
-            "sized": status.newest_sizes[1] if status.verdict == "fault" else None,
+            "sized": condition.sized,
             "outlook": status.outlook.model_dump() if status.outlook else None,
             "learning": status.learning,
             "heard": status.reception == "followed" and "silent" not in status.quality,
@@ -176,7 +178,7 @@ class ServiceRow(ApiResponse):
     @classmethod
     def from_status(cls, name: str, status: ServiceStatus) -> ServiceRow:
         """Return the row of a service."""
-        return cls(service=name, flood=status.flood, alarms=alarm_rows(name, status.alarms))
+        return cls(service=name, flood=status.flood, alarms=status_alarms(name, status))
 
 
 class FleetStatus(ApiResponse):
@@ -333,6 +335,17 @@ def alarm_rows(asset: str, alarms: Mapping[str, AlarmStatus]) -> list[AlarmRow]:
     ]
 
 
+def status_alarms(name: str, status: AssetStatus | ServiceStatus) -> list[AlarmRow]:
+    """Return the alarms of a status that are not normal; that of a fault says of it what the headline does."""
+    rows = alarm_rows(name, status.alarms)
+    if not isinstance(status, AssetStatus) or status.verdict != "fault":
+        return rows
+    condition = asset_condition(status)
+    # its alarm's state is younger once somebody has answered
+    fault = {"since": condition.since, "cause": condition.sentence}
+    return [row.model_copy(update=fault) if row.alarm == FAULT_ALARM else row for row in rows]
+
+
 def fault_sizes(status: AssetStatus) -> list[FaultSize]:
     """Return the sizes of the faults of a status; none while data quality overrules it."""
     words = status.metadata.faults
@@ -345,7 +358,7 @@ def fault_sizes(status: AssetStatus) -> list[FaultSize]:
             low=fault.interval[0],
             high=fault.interval[1],
         )
-        for fault in (status.newest_sizes[0] if status.verdict == "fault" else ())
+        for fault in asset_condition(status).sizes
     ]
 
 
