@@ -48,11 +48,11 @@ def test_a_fault_is_told_with_when_how_large_and_how_sure(loop: Loop) -> None:
     assert not page.wrong and not page.open
 
 
-def test_the_page_is_one_well_formed_document_with_five_pictures(loop: Loop) -> None:
+def test_the_page_is_one_well_formed_document_with_six_pictures(loop: Loop) -> None:
     page = read(make_diagnosis(), loop)
     pictures = [attrs for tag, attrs in page.tags if tag == "svg" and attrs.get("role") == "img"]
     ids = [attrs["id"] for _, attrs in page.tags if attrs.get("id")]
-    assert len(pictures) == 5
+    assert len(pictures) == 6
     assert all("width" not in attrs and "height" not in attrs for attrs in pictures)
     assert len(ids) == len(set(ids)), "an id stands twice"
     used = {str(attrs["xlink:href"]).removeprefix("#") for tag, attrs in page.tags if tag == "use"}

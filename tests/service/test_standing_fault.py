@@ -144,7 +144,7 @@ def test_after_a_repair_a_leak_has_the_size_that_is_left(leaky: Asset) -> None:
         block = Block("press", 1000 + k, np.asarray(t), recorded.r[rows], recorded.u[rows], recorded.y[rows])
         assert not any(one.is_new for one in leaky.process(block).transitions if one.alarm == "fault")
     status = AssetStatus.model_validate(leaky.status(leaky.state))
-    assert status.verdict == "healthy" and status.size is not None and status.size.may_be_healthy
+    assert status.verdict == "healthy" and status.size is not None
     assert status.size.ratio == pytest.approx(1.0, abs=0.02)
     assert "as before the fault (leakage " in status.summary
     assert "as before the fault (leakage " in asset_condition(status).headline

@@ -180,7 +180,7 @@ def test_a_service_that_stops_is_told_and_its_restart_too(open_page: Open, tmp_p
             link = page.locator(".link")
             expect(link).to_have_text("Live")
         page.clock.fast_forward("01:05")
-        expect(link).to_have_text("Nothing new for a minute: does the service run?")
+        expect(link).to_have_text("Nothing new: does the service run?")
         accessible(page)
         with screens.process("run", path.name, cwd=tmp_path):
             expect(link).to_have_text("Live", timeout=LONG_MS)

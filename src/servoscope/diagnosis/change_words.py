@@ -14,6 +14,8 @@ MAX_FRACTION_ERROR = 0.05  # of a change that is called by a fraction, relative 
 MIN_FACTOR = 2.5  # ratio from which a change is a multiple of the healthy value, not a percentage more than it
 
 
+INVERSE = frozenset({"motor_constant"})  # faults whose parameter is u per force, and whose quantity is force per u
+MIN_LEFT_SHARE = 0.1  # of a change that was repaired, from which on something is said to be left of it
 MIN_LIKELY_PROBABILITY = 0.5  # of an explanation of a suspect recording that is worth telling
 MAX_ONE_IN = 1e6  # recordings: no model is believed further
 
@@ -46,17 +48,16 @@ def change_messages(faults: Sequence[FaultEstimate]) -> tuple[Message, ...]:
 
 def relative_changes(faults: Sequence[FaultEstimate]) -> tuple[Message, ...]:
     """Return how far each fault is from healthy: ``friction +5 %``."""
-    return tuple(
-        message("change.relative", name=quantity_name(fault), percent=100.0 * (fault.ratio - 1.0)) for fault in faults
-    )
+    sizes = ((quantity_name(fault), 100.0 * (_of_quantity(fault).ratio - 1.0)) for fault in faults)
+    return tuple(message("change.relative", name=name, percent=percent) for name, percent in sizes)
 
 
 def after_repair(before: Sequence[FaultEstimate], now: FaultEstimate | None) -> Message:
     """Return what is left of faults that were repaired, of a machine that is healthy; `now`: its size, if known."""
     if now is None or [now.name] != [fault.name for fault in before]:
         return message("service.examination.as_before", sizes=None)
-    changes = relative_changes((now,))
-    if not now.may_be_healthy:
+    changes, share = relative_changes((now,)), (now.ratio - 1.0) / (before[0].ratio - 1.0)
+    if not now.may_be_healthy and share > MIN_LEFT_SHARE:
         return message("service.examination.not_quite", changes=changes)
     return message("service.examination.as_before", sizes=message("service.examination.scatter", changes=changes))
 
@@ -66,10 +67,15 @@ def fault_label(name: str) -> str:
     return name.replace("_", " ")
 
 
+def quantity_label(name: str) -> Message | str:
+    """Return the quantity that rises or falls with the fault of this name."""
+    return message(f"quantity.{name}") if f"quantity.{name}" in catalogue() else fault_label(name)
+
+
 def quantity_name(fault: FaultEstimate) -> Message | str:
     """Return the quantity that rises or falls with a fault."""
     if f"quantity.{fault.name}" in catalogue():
-        return message(f"quantity.{fault.name}")
+        return quantity_label(fault.name)
     kind, of, joint = fault.name.partition(" of ")
     if of:
         return message("quantity.of_joint", kind=kind, joint=joint)
@@ -78,7 +84,16 @@ def quantity_name(fault: FaultEstimate) -> Message | str:
     return message("quantity.other", name=fault_label(fault.name), parameter=fault.parameter)
 
 
+def _of_quantity(fault: FaultEstimate) -> FaultEstimate:
+    """Return a fault with the ratio of its quantity, which may be the inverse of its parameter."""
+    if fault.name not in INVERSE:
+        return fault
+    low, high = fault.interval
+    return fault.model_copy(update={"ratio": 1.0 / fault.ratio, "interval": (1.0 / high, 1.0 / low)})
+
+
 def _change_message(fault: FaultEstimate) -> Message:
+    fault = _of_quantity(fault)
     name, (low, high) = quantity_name(fault), fault.interval
     if fault.mass_kg is not None and not fault.mass_kg[1] <= 0.0 <= fault.mass_kg[2]:
         return message("change.mass", name=name, mass=fault.mass_kg[0])

@@ -23,6 +23,7 @@ from servoscope.models.plants import Plant
 MIN_CHANGE_STD = 3.0  # standard deviations from which a value has changed
 MAX_VALUES_LISTED = 3  # values, and rejected candidates
 MAX_PROBABILITY_REJECTED = 0.01  # probability below which a candidate is rejected
+MAX_FINE_CHANGE = 0.5  # relative change; a recording that shows only larger ones is no proof of health
 MIN_LISTED_PROBABILITY = 0.05  # probability below which a second fault, or an explanation, is not mentioned
 
 
@@ -49,6 +50,8 @@ def build_headline(
     if verdict == "healthy" and not intervals:
         sizes = sorted((size, parameter) for parameter, (size, _) in detectable.items())
         smallest = tuple(message("diagnosis.smallest", parameter=parameter, size=size) for size, parameter in sizes)
+        if sizes and sizes[0][0] > MAX_FINE_CHANGE:
+            return message("diagnosis.healthy_coarse", point=at, smallest=smallest)
         if not unwatched:
             return message("diagnosis.healthy", point=at, smallest=smallest)
         return message("diagnosis.healthy_limits", point=at, smallest=smallest, unwatched=tuple(unwatched))

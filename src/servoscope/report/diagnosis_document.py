@@ -91,6 +91,7 @@ def _sections(d: Diagnosis, known: DiagnosisContext) -> Document:
     sections = (
         _headline(d, known),
         Section("What to check", tuple(_checks(d, known)), HEADLINE),
+        Section("What has changed", (PicturePart("change"),), EVIDENCE, say("report.change")),
         Section("When it was there", _timeline(d, known), EVIDENCE),
         Section("What else it could be", tuple(_explanations(d, known)), EVIDENCE, _other_causes(d)),
         Section("The arm and its joints", (PicturePart("arm"),), EVIDENCE, say("arm.page_joints")),
@@ -104,9 +105,7 @@ def _sections(d: Diagnosis, known: DiagnosisContext) -> Document:
             DETAILS,
             _agreement(d),
         ),
-        Section(
-            "Inverse frequency response", (PicturePart("ifrf"), *_responses(d, known)), DETAILS, say("report.ifrf")
-        ),
+        Section("Inverse frequency response", _responses(d, known), DETAILS, say("report.ifrf")),
         Section(
             "Coefficients", (PicturePart("coefficients"), *_coefficients(d, known)), DETAILS, say("report.coefficients")
         ),
@@ -367,11 +366,11 @@ def _agreement(d: Diagnosis) -> str:
     return say("report.agree.not", **labels)
 
 
-def _responses(d: Diagnosis, known: DiagnosisContext) -> tuple[ResultTable, ...]:
+def _responses(d: Diagnosis, known: DiagnosisContext) -> tuple[Part, ...]:
     unit = f" [{known.units[1]}/{known.units[0]}]" if known.units[1] else ""
     head = ("Frequency", f"Real part{unit}", "healthy", f"Imaginary part{unit}", "healthy", "Magnitude", "Phase [°]")
     rows = [(f"{format_quantity(point.frequency_hz)} Hz", *_response_cells(point)) for point in d.ifrf]
-    return (ResultTable(head, rows),) if rows else ()
+    return PicturePart("ifrf"), *((ResultTable(head, rows),) if rows else ())
 
 
 def _response_cells(point: ResponsePoint) -> tuple[str, ...]:

@@ -108,22 +108,25 @@ def plot_statistic(trace: Trace, diagnosis: Diagnosis | None = None) -> Figure:
 
 
 @plot_style()
-def plot_coefficients(trace: Trace, diagnosis: Diagnosis | None = None, *, units: Sequence[str] = ()) -> Figure:
+def plot_coefficients(
+    trace: Trace, diagnosis: Diagnosis | None = None, *, units: Sequence[str] = (), only: int | None = None
+) -> Figure:
     """Draw each coefficient's deviation from its healthy expectation over time, with bands of two sigma.
 
     In percent of the expectation, or in units of the coefficient where the expectation is no larger than the
     estimate's standard deviation.
 
-    `units`: of the n coefficients; empty where unknown.
+    `units`: of the n coefficients; empty where unknown. `only`: the number of one that is drawn alone.
     """
-    n = len(trace.names)
+    shown = range(len(trace.names)) if only is None else (only,)
+    n = len(shown)
     columns = 1 if n == 1 else 2
     rows = -(-n // columns)
     figure, axes = create_panels(0.7 + 1.65 * rows, rows, columns, sharex=True, squeeze=False)
     unit, factor = time_axis_unit(float(np.ptp(trace.t)) if len(trace.t) else 0.0)
     for i, ax in enumerate(axes.flat):
         if i < n:
-            _coefficient(ax, trace, i, factor, units[i] if i < len(units) else "")
+            _coefficient(ax, trace, shown[i], factor, units[shown[i]] if shown[i] < len(units) else "")
             _marks(ax, diagnosis, factor)
             ax.xaxis.set_tick_params(labelbottom=i + columns >= n)
             if i + columns >= n:

@@ -18,6 +18,7 @@ from servoscope.diagnosis.motion_signature import MotionSignature, SignatureWidt
 from servoscope.diagnosis.result import Diagnosis
 from servoscope.models.loop import Loop
 from servoscope.report import diagnosis_figures as figures
+from servoscope.report.change_figure import plot_change, shows_change
 from servoscope.report.diagnosis_document import LABELS, DiagnosisContext, diagnosis_document
 from servoscope.report.document import DETAILS, HEADLINE, Section, to_html
 from servoscope.report.format_values import DASH, format_clock_time, format_count, format_quantity, format_with_std
@@ -141,7 +142,10 @@ def _figures(
     if sizes is not None:
         yield "sizes", sizes
     before, after = signatures
-    if after is not None:
+    if diagnosis.verdict == "fault":
+        units, own = loop.plant.units, tuple(loop.plant.coefficient_units)
+        yield "change", plot_change(trace, diagnosis, before, after, units=units, coefficient_units=own)
+    if after is not None and not (diagnosis.verdict == "fault" and shows_change(before, after)):
         yield "signature", figures.plot_signature(before, after, units=loop.plant.units)
 
 

@@ -14,7 +14,7 @@ from fastapi import APIRouter, FastAPI
 from starlette.exceptions import HTTPException
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, Response
+from starlette.responses import FileResponse, RedirectResponse, Response
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
@@ -133,6 +133,7 @@ def _add_pages(app: FastAPI) -> None:
     site = folder.parents[1] / "site"  # which wheels bring: see `servoscope docs`
     if site.is_dir():
         app.mount(HELP, _NoCacheFiles(directory=site, html=True))
+        app.add_api_route(HELP, lambda: RedirectResponse(f"{HELP}/"), include_in_schema=False)
 
     @app.api_route("/{path:path}", methods=["GET", "HEAD"], include_in_schema=False)
     async def get_page(request: Request, path: str) -> Response:

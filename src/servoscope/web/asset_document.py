@@ -42,6 +42,8 @@ def asset_document(status: AssetStatus, diagnosis: Diagnosis | None, checks: Seq
 def _next_step(status: AssetStatus) -> str:
     """Return what to do where there is no fault."""
     if status.verdict == "healthy":
+        if status.metadata.coarse is not None and FAULT_ALARM not in status.alarms:
+            return say("report.check.coarse", more=status.metadata.coarse[-1])
         return say("report.check.answer" if FAULT_ALARM in status.alarms else "report.check.healthy")
     if status.repaired is not None and status.reception == "followed" and not status.quality:
         return say("report.check.repaired", minutes=(status.metadata.window_s or 0.0) / 60.0)

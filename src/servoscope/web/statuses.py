@@ -45,6 +45,7 @@ class _Alarm(msgspec.Struct):
 
 class _About(msgspec.Struct):
     group: str = ""
+    coarse: tuple[object, ...] | None = None
 
 
 class _Columns(msgspec.Struct):
@@ -57,6 +58,7 @@ class _Columns(msgspec.Struct):
     alarms: dict[str, _Alarm] = {}
     about: _About = msgspec.field(default_factory=_About)
     learning: dict[str, object] | None = None
+    repaired: float | None = None
     service: bool = False
 
 
@@ -105,7 +107,8 @@ class FleetTable:
 
 
 def _is_plain(status: _Columns) -> bool:
-    return status.verdict == "healthy" and FAULT_ALARM not in status.alarms and status.learning is None
+    noted = status.learning is not None or status.repaired is not None or status.about.coarse is not None
+    return status.verdict == "healthy" and FAULT_ALARM not in status.alarms and not noted
 
 
 def severity(status: AssetStatus | _Columns) -> float:

@@ -53,7 +53,7 @@ TERMS: dict[str, tuple[TermColumn, ...]] = {
 
 OF_POSITION = "stiffness", "gravity", "load_friction", "cogging"
 
-MOVED_MASS_CHECKS = "what is moved: workpiece, tool, coupling"
+MOVED_MASS_CHECKS = "what is moved: workpiece, tool; a loose belt or coupling, where the encoder sits at the motor"
 # parameter -> name of the fault, all that does the same to u and y, and what to check
 FAULTS = {
     "inertia": ("payload", "more moved mass: a payload, a coupling, a tool", MOVED_MASS_CHECKS),

@@ -92,7 +92,7 @@ class Asset(StateHolder):
         self.name, self.machine, self.policy, self.source = name, to_machine(machine), policy, source
         self.monitor, self._rate, self._phase = monitor, self.machine.rate, examination_phase(name)
         self._schedule = DiagnosisSchedule(policy.diagnosis.window_s, policy.diagnosis.after_s)
-        self._metadata = asset_metadata(self.machine, group, policy.diagnosis.window_s, source)
+        self._metadata = asset_metadata(self.machine, group, policy.diagnosis.window_s, source, policy.pause_s)
         self._limits = policy.quality.limits(self._rate, policy.pause_s)
         self.lanes = BlockLanes(self._rate, self._limits, policy.residual_every_s)
         self.alarms = AssetAlarms(policy.alarms, policy.prognosis.ahead_s, limited=bool(policy.limits))
@@ -375,8 +375,7 @@ class Asset(StateHolder):
             self._phase,
             sound=quality.limit_verdict("fault", quality.active_findings(state.quality)) == "fault",
         )
-        if examination is not state.examination:
-            self.state = replace(state, examination=examination)
+        self.state = replace(state, examination=examination)
         if result is None:
             return
         if result.size is not None:

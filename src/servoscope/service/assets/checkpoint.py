@@ -111,7 +111,7 @@ def pack_state(state: AssetState) -> bytes:
         "asset": state.asset,
         "baseline": state.baseline,
         "counted": vars(state.position),
-        "judged": vars(state.examination),
+        "judged": state.examination.to_json(),
         "last": state.last_t,
         "fed": state.samples,
         "thinned": vars(state.history),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from servoscope.core.messages import message, render, say
-from servoscope.diagnosis.change_words import after_repair, change_messages, relative_changes
+from servoscope.diagnosis.change_words import after_repair, change_messages, quantity_label, relative_changes
 from servoscope.isolation.candidate import FaultEstimate
 from servoscope.service.alarms import FAULT_ALARM
 from servoscope.service.assets.status import AssetStatus
@@ -28,6 +28,10 @@ def asset_condition(status: AssetStatus, gone: str = "") -> AssetCondition:
     is_fault, mended = status.verdict == "fault", status.verdict != "fault" and status.repaired is not None
     sizes, sized = status.newest_sizes if is_fault else ((), None)
     sentence = _repair_sentence(status) or _sentence(status, gone)
+    if status.verdict == "healthy" and status.metadata.coarse is not None:
+        fault, now, later, further = status.metadata.coarse
+        values = {"fault": quantity_label(fault), "now": 100.0 * now, "later": 100.0 * later, "more": further}
+        sentence = f"{sentence.rstrip('.')}. {say('service.examination.coarse', **values)}"
     return AssetCondition(
         sentence=sentence,
         headline=sentence

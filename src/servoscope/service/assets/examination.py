@@ -181,7 +181,7 @@ def _follow_size(exam: Examination, fault: str, first: int) -> FaultEstimate | N
         candidates = isolate(own, deviation, covariance)
     except (ServoscopeError, np.linalg.LinAlgError, ArithmeticError):
         return None
-    best = candidates[0] if exam.alarm.any() else next((one for one in candidates if one.faults), candidates[0])
+    best = candidates[0] if exam.alarm.any() else next((other for other in candidates if other.faults), candidates[0])
     return best.faults[0] if best.name == fault else None
 
 

@@ -85,6 +85,11 @@ class ExaminationState:
         is_newer = bool(self.size) and known == [self.size["name"]] and (self.sized or 0.0) >= (self.diagnosed or 0.0)
         return [self.size] if is_newer else self.faults
 
+    def to_json(self) -> dict[str, Any]:
+        """Return its fields as a checkpoint keeps them, those of a repair only after one."""
+        kept = vars(self)
+        return kept if self.repaired is not None else {k: v for k, v in kept.items() if k not in ("repaired", "before")}
+
     def window_begin(self, t: float, window_s: float) -> float:
         """Return from when on samples are examined at `t` [UTC s]."""
         return max(t - window_s, -math.inf if self.repaired is None else self.repaired)

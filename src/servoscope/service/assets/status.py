@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from servoscope.baseline.records import Occasion
+from servoscope.baseline.records import RENEWALS, Occasion
 from servoscope.core.messages import message, render
 from servoscope.core.verdict import VerdictKind
 from servoscope.isolation.candidate import FaultEstimate
@@ -81,6 +81,8 @@ class AssetMetadata(_StatusRecord):
     faults: dict[str, str] = {}  # what their names mean
     checks: dict[str, tuple[str, ...]] = {}  # what to check on the machine: of the faults that are named now
     window_s: float | None = None  # what an examination covers
+    pause_s: float = 0.0  # how long its source may pause
+    coarse: tuple[str, float, float, int] | None = None  # `CoarseMonitoring` of its baseline
 
 
 class AssetVerdict(_StatusRecord):
@@ -146,9 +148,17 @@ def read_status(stored: Mapping[str, Any]) -> AssetStatus | ServiceStatus:
     return (ServiceStatus if stored.get("service") else AssetStatus).model_validate(stored)
 
 
-def asset_metadata(machine: Machine, group: str, window_s: float, source: str = "") -> dict[str, Any]:
+def asset_metadata(
+    machine: Machine, group: str, window_s: float, source: str = "", pause_s: float = 0.0
+) -> dict[str, Any]:
     """Return the metadata of an asset that is this machine, as stored."""
+    baseline, coarse = machine.loop_baseline, None
+    if baseline is not None and baseline.revision.kind in RENEWALS:
+        from servoscope.learning.coarse import coarse_monitoring  # it loads what learns
+
+        coarse = coarse_monitoring(baseline)
     signals: dict[str, Any] = {} if machine.units is None else {"point": machine.point or None, "units": machine.units}
+    signals |= ({"pause_s": pause_s} if pause_s else {}) | ({} if coarse is None else {"coarse": coarse})
     return AssetMetadata(
         group=group,
         source=source,

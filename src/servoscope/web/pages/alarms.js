@@ -93,7 +93,7 @@ export async function show(main, { session, signal, linked, values }) {
     flood.hidden = !found.flood;
     if (found.flood) tell(flood, `Alarm flood since ${moment(found.flood.since)}: ${found.flood.counted} new alarms, ${found.flood.held} held back.`);
     draw();
-    past.replaceChildren(history(steps.transitions, true));
+    past.replaceChildren(history(steps.transitions));
   }
 
   await look();
@@ -109,16 +109,16 @@ export async function show(main, { session, signal, linked, values }) {
 }
 
 // Steps of alarms, the newest first.
-export function history(transitions, named) {
+function history(transitions) {
   if (!transitions.length) return h("p", { class: "empty" }, "No alarm has ever occurred.");
   return table(
     "Steps of alarms, the newest first",
-    ["When", ...(named ? ["Asset"] : []), "Alarm", "Step", "Cause", "Who"],
+    ["When", "Asset", "Alarm", "Step", "Cause", "Who"],
     [...transitions]
       .reverse()
       .map((one) => [
         h("span", { class: "t" }, moment(one.t)),
-        ...(named ? [h("a", { class: "t", href: `/assets/${part(one.asset)}` }, one.asset)] : []),
+        h("a", { class: "t", href: `/assets/${part(one.asset)}` }, one.asset),
         h("span", {}, plain(one.alarm), one.priority && h("small", {}, ` ${one.priority}`)),
         `${STATES[one.before]} → ${STATES[one.after]}`,
         one.cause ? h("span", {}, prose(one.cause)) : DASH,

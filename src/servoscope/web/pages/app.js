@@ -78,6 +78,7 @@ function surround() {
       h("span", { class: "person", title: "All times are of this time zone", translate: "no" }, ZONE),
       person,
       LANGUAGES.length > 1 && languageSwitch(),
+      h("a", { class: "person", href: "/help", target: "_blank", hreflang: "en" }, "Help"),
       theme,
     );
 }
@@ -105,12 +106,13 @@ function logInAgain() {
   return asking;
 }
 
-const LINK = { live: "Live", quiet: "Nothing new for a minute: does the service run?", lost: "Connection lost, trying again" };
+const LINK = { live: "Live", quiet: "Nothing new: does the service run?", lost: "Connection lost, trying again" };
 
 // Whether what is on the page is still being told: words, beside the navigation.
 function linked(state) {
   mark(link, "data-state", state);
   tell(link, LINK[state]);
+  mark(link, "title", LINK[state]);
 }
 
 function entitle(title) {

@@ -1,17 +1,17 @@
 // One asset: the verdict in words, where its inverse response is now, both tests, parameters, signals, alarms; live.
 import { get, part, query } from "./api.js";
-import { history as steps } from "./alarms.js";
 import { drawnArm } from "./arm.js";
 import { bode } from "./bode.js";
 import { plot } from "./charts.js";
 import { commands, STATES } from "./commands.js";
-import { signals as drawn, signature, tests } from "./curves.js";
+import { showsChange, signals as drawn, signature, tests } from "./curves.js";
 import { editor } from "./checks.js";
 import { evidence, outline, refresh, verdict } from "./document.js";
 import { h, section, table, tell, titled, translate } from "./dom.js";
 import { growth } from "./growth.js";
 import { follow } from "./live.js";
-import { badge, priority, prose, STATUS, VERDICTS } from "./marks.js";
+import { events } from "./events_list.js";
+import { badge, priority, STATUS } from "./marks.js";
 import { parameters } from "./parameters.js";
 import { periods } from "./periods.js";
 import { planes } from "./planes.js";
@@ -23,7 +23,6 @@ const SPANS = { "1 h": 3600, "24 h": 86400, "7 d": 604800, "30 d": 2592000, "1 y
 const SIGNALS = { "30 s": 30, "10 min": 600, "1 h": 3600 };
 const SIGNALS_EVERY_MS = 2000;
 const POINTS = 500;
-const LISTED = 20; // diagnoses
 
 export async function show(main, { session, signal, linked, values, part: name, entitle }) {
   entitle(name);
@@ -37,11 +36,13 @@ export async function show(main, { session, signal, linked, values, part: name, 
   const grown = growth(path, name, () => asset, { session, values, signal });
   const happened = timeline(path, () => asset, signal);
   const said = h("p", { class: "working", role: "status" });
-  const [standing, past, diagnoses, counted] = [h("div", {}), h("div", {}), h("div", {}), h("p", { class: "note" })];
+  const [standing, past, counted] = [h("div", {}), h("div", {}), h("p", { class: "note" })];
+  const alarms = section("Alarms", null, standing, said);
   const certainty = h("div", {});
   const learned = relearning(path, session, () => asset, signal);
   const [response, motion, widths] = [h("div", { class: "plot" }), h("div", { class: "plot" }), h("p", { class: "note" })];
   const signed = section("Motion signature", "Mean input over position, forward (solid) and backward (dashed), and over speed: the gap between the two directions is friction.", motion, widths);
+  const place = h("div", {});
   const compared = periods(path, () => asset, values, signal);
   const statistic = h("div", { class: "plot tall" });
   const samples = h("div", { class: "plot tall" });
@@ -55,21 +56,10 @@ export async function show(main, { session, signal, linked, values, part: name, 
   main.replaceChildren(
     h("div", { class: "head" }, h("h1", {}, name), h("span", { class: "note" }, about), h("span", { class: "gap" }), baseline, h("details", { class: "code" }, h("summary", {}, "On a phone"), h("img", { src: `/api/v1${path}/code.svg`, alt: translate("QR code of this page"), loading: "lazy" })), h("button", { type: "button", class: "screen", onclick: () => print() }, "Print")),
     top.element,
+    // what shows the change first; of the rest a phone shows the titles
+    h("div", { class: "columns" }, arm, place, grown.element, alarms),
     certainty,
-    h(
-      "div",
-      { class: "columns" },
-      half(section("Alarms", null, standing, said, past)),
-      half(section("Diagnoses", null, diagnoses)),
-      learned.element,
-      happened.element,
-      grown.element,
-      half(titled("Signals", lengths, samples)),
-      arm,
-      signed,
-      compared.element,
-      half(section("Stream", null, counted)),
-    ),
+    h("div", { class: "columns" }, [section("Events", "What its alarms did, what diagnoses found, and what people did and noted.", past), happened.element, learned.element, compared.element, half(titled("Signals", lengths, samples)), half(section("Stream", null, counted))].map(folded)),
     h("details", { class: "experts" }, h("summary", {}, "For experts"), h(
       "div",
       { class: "columns" },
@@ -77,6 +67,7 @@ export async function show(main, { session, signal, linked, values, part: name, 
       section("Inverse frequency response", "Input per unit of output, as a complex number: the diamond is healthy, the dot is now, its ellipse holds 95 %. Each panel has its own scales.", plane.element),
       section("Inverse response over frequency", "Magnitude and phase, before (healthy) and now, with the band that holds 95 %.", response),
       half(titled("Distance from healthy", spans, statistic)),
+      signed,
       half(section("Coefficients", "Against what a healthy loop would show under the same reference.", sizes.element)),
     )),
   );
@@ -121,9 +112,8 @@ export async function show(main, { session, signal, linked, values, part: name, 
   }
 
   async function look() {
-    const [alarms, found] = await Promise.all([get(query(`${path}/alarms`, { last: 50 }), signal), get(query("/diagnoses", { asset: name, last: 50 }), signal)]);
-    past.replaceChildren(steps(alarms.transitions, false));
-    diagnoses.replaceChildren(list(found.diagnoses.slice(-LISTED)));
+    const [{ transitions }, found, { notes }] = await Promise.all([get(query(`${path}/alarms`, { last: 50 }), signal), get(query("/diagnoses", { asset: name, last: 50 }), signal), get(`${path}/notes`, signal)]);
+    past.replaceChildren(events(transitions, found.diagnoses, notes));
     const inFull = found.diagnoses.filter((one) => one.grounds === "full");
     if (isArm && inFull.length) await draw(inFull.at(-1));
     await explain(inFull.at(-1), inFull.find((one) => one.t >= began(asset)));
@@ -153,8 +143,9 @@ export async function show(main, { session, signal, linked, values, part: name, 
     const fresh = moved === null;
     moved = [before, { ...now, words: "after" }].filter(Boolean);
     signed.hidden = false;
+    if (showsChange(moved)) place.replaceChildren(signed); // else the growth of the fault shows it
     if (fresh) plot(motion, "Mean input over position and speed, before and now", (c) => signature(c, { curves: moved, units }), signal);
-    const width = (key, of) => moved.filter((one) => one[key]).map((one) => `${one.words === "before" ? "before" : "now"} ${number(one[key][0], 3)} ± ${number(1.96 * one[key][1], 2)} ${of ?? ""}`);
+    const width = (key, of) => moved.filter((one) => one[key]).map((one) => `${one.words === "before" ? "before" : "now"} ${number(one[key][0], 3)} ± ${number(1.96 * one[key][1], 2)}${of ? ` ${of}` : ""}`);
     const told = [["Friction band", width("friction_band", units.u)], ["Lost motion", width("lost_motion", units.y)]].filter(([, each]) => each.length);
     tell(widths, told.map(([words, each]) => `${words}: ${each.join(", ")}.`).join(" "));
   }
@@ -204,7 +195,8 @@ export async function show(main, { session, signal, linked, values, part: name, 
     const key = JSON.stringify(asset.alarms);
     if (key !== alarmed) {
       alarmed = key;
-      standing.replaceChildren(asset.alarms.length ? current(asset.alarms, session, answered) : h("p", { class: "empty" }, "Nothing asks for an answer."));
+      alarms.hidden = !asset.alarms.length;
+      standing.replaceChildren(...(asset.alarms.length ? [current(asset.alarms, session, answered)] : []));
     }
   }
 
@@ -229,6 +221,12 @@ export async function show(main, { session, signal, linked, values, part: name, 
 // Since when there is a fault.
 function began({ verdict, onset, since }) {
   return verdict === "fault" ? (onset ?? since) : null;
+}
+
+// On a phone a section is its title, until somebody unfolds it.
+function folded(element) {
+  if (!matchMedia("(max-width: 34rem)").matches) return element;
+  return h("details", { class: "fold" }, h("summary", {}, element.querySelector("h2").textContent), element);
 }
 
 const half = (element) => (element.classList.add("half"), element);
@@ -275,14 +273,5 @@ function current(alarms, session, answered) {
       h("span", { class: "t" }, moment(one.since)),
       commands(one, session, answered),
     ]),
-  );
-}
-
-export function list(diagnoses) {
-  if (!diagnoses.length) return h("p", { class: "empty" }, "No diagnosis yet.");
-  return table(
-    "Diagnoses, the newest first",
-    ["When", "Verdict", "Grounds", "In words"],
-    [...diagnoses].reverse().map((one) => [h("a", { class: "t", href: `/diagnoses/${part(one.id)}` }, moment(one.t)), badge(one.verdict, VERDICTS[one.verdict]), one.recording ?? one.grounds, prose(one.summary)]),
   );
 }

@@ -80,6 +80,12 @@ export function signature(c, { curves, units }) {
   };
 }
 
+// Whether the friction bands before and after the onset are certainly apart, so that the signature shows the change.
+export function showsChange(curves) {
+  const [before, after] = ["before", "after"].map((words) => curves.find((one) => one.words === words)?.friction_band);
+  return Boolean(before && after) && Math.abs(after[0] - before[0]) > 3 * Math.hypot(before[1], after[1]);
+}
+
 export const short = (value) => (value === 0 ? "0" : number(Number(value.toPrecision(3)), 3).replace(/(\.\d*?)0+(?=$| )/, "$1").replace(/\.(?=$| )/, ""));
 
 // A size over months as a change in percent, with its 95 % band: dots are full diagnoses, the dashes lead to the limit.

@@ -1,7 +1,7 @@
 // A recording from a file to its verdict: drop it, see what is in it, say which column is what, compare it with a baseline.
 import { get, job, mayChange, part, query } from "./api.js";
 import { assessed } from "./assessment.js";
-import { list } from "./asset.js";
+import { list } from "./events_list.js";
 import { during, field, h, section } from "./dom.js";
 import { inspected } from "./inspection.js";
 import { kept } from "./kept.js";

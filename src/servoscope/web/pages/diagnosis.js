@@ -2,7 +2,7 @@
 import { get, part, query } from "./api.js";
 import { drawnArm } from "./arm.js";
 import { plot } from "./charts.js";
-import { coefficient, signals, signature, tests } from "./curves.js";
+import { coefficient, showsChange, signals, signature, tests } from "./curves.js";
 import { details, evidence, experts, verdict } from "./document.js";
 import { h } from "./dom.js";
 import { prose, VERDICTS } from "./marks.js";
@@ -52,7 +52,13 @@ function picturesOf(found, said, picture, drawn, signal) {
   if (found.arm) made.arm = () => drawnArm(found.arm);
   if (found.signals) made.signals = () => picture("Reference, output and input", (c) => signals(c, { ...found.signals, units, marks }), "plot tall");
   if (trace) made.statistic = () => picture("Both tests over time, as multiples of their limits", (c) => tests(c, { ...trace, marks, clock: false, range: [trace.t[0], trace.t.at(-1)] }));
-  if (found.signature?.length) made.signature = () => picture("Mean input over position and speed", (c) => signature(c, { curves: found.signature, units }));
+  const changed = showsChange(found.signature ?? []);
+  if (found.verdict === "fault" && changed) made.change = () => picture("Mean input for the same motion, before and after", (c) => signature(c, { curves: found.signature, units }));
+  else if (found.verdict === "fault" && trace?.parameters?.length) {
+    const one = farthest(trace.parameters);
+    made.change = () => picture(`Deviation of ${one.name}, which moved most`, (c) => coefficient(c, { t: trace.t, one }));
+  }
+  if (found.signature?.length && !(changed && found.verdict === "fault")) made.signature = () => picture("Mean input over position and speed", (c) => signature(c, { curves: found.signature, units }));
   if (said.ifrf?.length) {
     made.ifrf = () => {
       const plane = planes(said.ifrf.map(response), units.response ?? "", signal);
@@ -65,6 +71,15 @@ function picturesOf(found, said, picture, drawn, signal) {
     made.coefficients = () => h("div", { class: "planes" }, trace.parameters.map((one) => h("div", {}, h("h3", {}, prose(one.name)), picture(`Deviation of ${one.name} over time`, (c) => coefficient(c, { t: trace.t, one })))));
   }
   return made;
+}
+
+// The coefficient that is farthest from healthy at the end, in standard deviations.
+function farthest(parameters) {
+  const distance = ({ value, nominal, std }) => {
+    const last = value.findLastIndex((each, i) => each !== null && std[i]);
+    return last < 0 ? 0 : Math.abs(value[last] - nominal[last]) / std[last];
+  };
+  return parameters.reduce((best, one) => (distance(one) > distance(best) ? one : best));
 }
 
 const response = (one) => ({ ...one, ellipse: [2 * one.real_std, 2 * one.imag_std, 0] });

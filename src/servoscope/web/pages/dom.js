@@ -52,7 +52,7 @@ export function table(caption, head, rows, attributes = {}) {
       ? named(content, i)
       : i === 0
         ? h("th", { scope: "row" }, content)
-        : named(h("td", { class: numeric[i] && "n" }, content), i);
+        : named(h("td", { class: numeric[i] && "n" }, content instanceof Element ? content : h("span", {}, content)), i);
   return h(
     "div",
     { class: "scroll", tabindex: "0", role: "region", "aria-label": caption },

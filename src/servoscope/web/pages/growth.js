@@ -142,10 +142,16 @@ export function growth(path, name, asset, { session, values, signal }) {
     advise(last);
     if (last) {
       const goal = limit.value !== "" ? Number(limit.value) : last.value < last.healthy ? 0.5 : 2;
-      forecast = await get(query(`${path}/trend`, { name: which.value, limit: goal }), signal);
+      // a size that nothing has been found of since the last repair is no error: its trend is empty
+      forecast = await get(query(`${path}/trend`, { name: which.value, limit: goal }), signal).catch((error) => {
+        if (error.status !== 404) throw error;
+        return null;
+      });
     }
     say(said, words(forecast, limit.value !== ""));
-    tell(why, last ? `${count(all.length)} values are shown, the last one of ${moment(last.t)}; ${forecast.explanation.join(" ")}` : "");
+    const shown = all.length === 1 ? "One value is shown" : `${count(all.length)} values are shown, the last one`;
+    const because = forecast?.rate_per_day ? forecast.explanation.join(" ") : "";
+    tell(why, last ? `${shown} of ${moment(last.t)}. ${because}`.trim() : "");
     picture.hidden = !last; // where there are no values there is no chart
     if (last) chart.draw();
   }
@@ -161,7 +167,7 @@ export function growth(path, name, asset, { session, values, signal }) {
 // Whether it grows, and until when, in words.
 function words(forecast, asked) {
   if (!forecast) return "Nothing has been followed yet: sizes are stored every ten minutes, and by each diagnosis.";
-  if (!forecast.rate_per_day) return forecast.summary;
+  if (!forecast.rate_per_day) return asked ? forecast.summary : "Too few values for a trend.";
   const week = forecast.rate_per_day.map((each) => 100 * WEEK * each);
   const grows = week[0] > 0 || week[2] < 0;
   const rate = grows ? `It changes by ${change(1 + week[1] / 100)} of healthy per week (${number(week[0], 2)} to ${number(week[2], 2)}).` : "No lasting change can be shown.";

@@ -3,7 +3,7 @@ import { translate } from "./translate.js";
 
 const USUAL = "how-to/read-a-verdict"; // of what a document says
 const PAGES = {
-  "alarms#life-cycle": ["Alarms", "What has happened"],
+  "alarms#life-cycle": ["Alarms", "Events", "What has happened"],
   "how-to/actions": ["Notifications"],
   "how-to/before-deployment": ["Studies", "How sure a size becomes", "How alike they look", "What else it could be"],
   "how-to/assess": ["What is wrong, without a baseline"],

@@ -1,7 +1,7 @@
 // Live updates: one stream per page, joined to at most one call per drawn frame; silent while the page is hidden.
 import { query } from "./api.js";
 
-const QUIET_S = 60.0; // without news: the server is there, the service perhaps not
+const QUIET_S = 60.0; // without news, beyond what sources pause: the server is there, the service perhaps not
 
 // Calls `heard({ event: [data, ...] })`. `state` hears "live", "quiet" or "lost"; the browser itself connects again.
 // `mark`: of what is known already, which is not sent once more.
@@ -10,13 +10,16 @@ export function follow(path, events, heard, state, signal, mark = "") {
   let wanted = 0;
   let source = null;
   let news = performance.now() / 1000; // when the newest of what is shown was stored [s]
+  let pause = 0; // of the source that pauses longest [s]
   const dated = events.includes("assets") || events.includes("asset"); // others tell what is rare
-  const judge = () => source?.readyState === EventSource.OPEN && state(dated && performance.now() / 1000 - news > QUIET_S ? "quiet" : "live");
+  const judge = () => source?.readyState === EventSource.OPEN && state(dated && performance.now() / 1000 - news > QUIET_S + pause ? "quiet" : "live");
   const flush = () => {
     wanted = 0;
     const told = waiting;
     waiting = {};
-    const latest = Math.max(...[...(told.assets ?? []).flatMap((each) => each.assets), ...(told.asset ?? [])].map((row) => row.at));
+    const rows = [...(told.assets ?? []).flatMap((each) => each.assets), ...(told.asset ?? [])];
+    const latest = Math.max(...rows.map((row) => row.at));
+    pause = Math.max(pause, ...rows.map((row) => row.pause_s));
     if (latest > -Infinity) news = performance.now() / 1000 - ((told.assets ?? told.asset).at(-1).now - latest);
     judge();
     heard(told);

@@ -30,12 +30,17 @@ export function periods(path, asset, values, signal) {
     const usual = [[counted.began, middle], [middle, t]];
     ends.forEach((pair, i) => pair.forEach((input, k) => (input.value = moment((values.get(KEYS[i])?.split(",").map(Number) ?? usual[i])[k]).replace(" ", "T"))));
     if (values.has(KEYS[0])) during(button, said, compare);
+    else if (onset > counted.began) during(button, said, show); // before the fault, and since
   }
 
   async function compare() {
     const told = new URLSearchParams(location.search);
     KEYS.forEach((key, i) => told.set(key, span(i).join()));
     history.replaceState(null, "", `${location.pathname}?${told}`);
+    await show();
+  }
+
+  async function show() {
     const found = await Promise.all(KEYS.map((_, i) => fetched(span(i))));
     const charts = found.map((one, i) => ({ words: NAMES[i], element: h("div", { class: "plot" }), history: one.history }));
     result.replaceChildren(beside(found), ...charts.map(({ words, element }) => h("div", { class: "half" }, h("h3", {}, words), element)));

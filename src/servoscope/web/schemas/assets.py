@@ -139,6 +139,7 @@ class AssetRow(AssetVerdict, ApiResponse):
     sizes: list[FaultSize]
     outlook: OutlookRow | None
     heard: bool
+    pause_s: float
     t: float
     at: float
     severity: float
@@ -161,6 +162,7 @@ class AssetRow(AssetVerdict, ApiResponse):
             "outlook": status.outlook.model_dump() if status.outlook else None,
             "learning": status.learning,
             "heard": status.reception == "followed" and "silent" not in status.quality,
+            "pause_s": status.metadata.pause_s,
             "t": status.position.t,
             "at": at,
             "severity": severity(status),
