@@ -148,10 +148,10 @@ def test_a_node_sends_diagnostics_and_faults_until_they_are_accepted_and_gone(
     (array,) = ros.sent
     assert array.header.stamp.nanosec == 2
     assert [(one.level, one.name, one.hardware_id) for one in array.status] == [
-        (STORE.types[STATUS].ERROR, "servoscope: press", "press"),
         (STORE.types[STATUS].OK, "servoscope: axis 7/ä", "axis 7/ä"),
+        (STORE.types[STATUS].ERROR, "servoscope: press", "press"),
     ]
-    values = {value.key: value.value for value in array.status[0].values}
+    values = {value.key: value.value for value in array.status[1].values}
     assert values["leakage.size"] == "1.2" and values["leakage.check_2"] == "Valve; return line."
     assert values["leakage.since"] == "2025-12-31T23:59:40Z"
     ros.accepts = True

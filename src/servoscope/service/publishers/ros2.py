@@ -64,8 +64,8 @@ class Ros2Publisher(FilesPublisher):
                 self._reports |= {report["fault_code"]: report for report in map(failed, items)}
         document = {
             "until": time.time() + LOOKS * self._every_s,
-            "status": list(self._diagnostics.values()),
-            "reports": list(self._reports.values()),
+            "status": [message for _, message in sorted(self._diagnostics.items())],
+            "reports": [report for _, report in sorted(self._reports.items())],
         }
         return {FILE: json.dumps(document, indent=1, allow_nan=False).encode()}
 
