@@ -47,6 +47,7 @@ def test_logs_with_the_names_of_makers_are_right_and_never_wrong_in_silence(tmp_
         ("t|Position|ActualPosition|d_axis_current|q_axis_current", "0142"),
         ("t|measured current|setpoint|speed", "0213"),
         ("t|q1|q2|tau2|q_des2", "0432"),
+        ("t|r|tau|theta_d|theta", "0124"),
         ("t|target_theta|theta|control_output|feedforward|plant_input|saturation", "0152"),
         ("t|force setpoint|valve|measured force", "0123"),
     ],

@@ -155,6 +155,7 @@ def _output_cost(meaning: NameParts) -> float | None:
             + (not measured)
             - preference
             + 2.0 * bool({*meaning.own} & VALVES)
+            + 1e-3 * len(meaning.own)  # theta before theta_d, which may be desired or a derivative
         )
     if measured:
         return 0.4
