@@ -30,7 +30,7 @@ from public import cranfield, qube
 from public.servoscope_detector import OURS, ROOT, with_gain
 from public.simple_detectors import detectors, judge
 from servoscope.core.arrays import FloatArray
-from servoscope.isolation.ml.axis_scan import scan_limit
+from servoscope.isolation.ml.axis_vibration import scan_limit
 from servoscope.isolation.ml.axis_window import AxisWindow
 from servoscope.isolation.ml.hypothesis import fit_hypothesis
 from servoscope.isolation.ml.window import ChangeProfile

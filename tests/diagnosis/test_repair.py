@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -68,3 +69,29 @@ def test_the_headline_of_a_repaired_asset_becomes_healthy(baseline: ss.Baseline)
     full = diagnose_blocks(baseline, "axis", [Block.from_signals("axis", 0, signals)])
     assert full.verdict == "healthy" and full.headline.key == "diagnosis.repaired"
     assert "to 1970-01-01 00:00:28" in full.summary
+
+
+def test_several_changes_of_an_axis_have_names_sizes_and_times(baseline: ss.Baseline) -> None:
+    course = [("coulomb_friction", 1.5, 12.0), ("inertia", 1.25, 24.0), ("coulomb_friction", 1.0, 38.0)]
+    several = [FaultEvent(*each) for each in (*course, ("inertia", 1.0, 38.0))]
+    found = ss.diagnose(baseline, moved(baseline.loop, 7, *several))
+    assert found.verdict == "fault"
+    first, both = found.intervals
+    assert {fault.name: fault.ratio for fault in first.faults} == pytest.approx({"dry_friction": 1.5}, rel=0.01)
+    assert {fault.name: fault.ratio for fault in both.faults} == pytest.approx(
+        {"dry_friction": 1.5, "payload": 1.25}, rel=0.01
+    )
+    for at, dates in ((12.0, first.onset_s), (24.0, both.onset_s), (38.0, both.end_interval_s)):
+        assert dates is not None and dates[0] <= at <= dates[2] and dates[2] - dates[0] < 3.0
+    assert {moved.name for moved in both.coefficients} >= {"inertia", "coulomb_friction"}
+    assert "healthy again since 3" in found.summary
+    assert ss.Diagnosis.model_validate_json(found.model_dump_json()) == found
+
+
+def test_a_baseline_from_before_has_no_changes_and_says_so(baseline: ss.Baseline, tmp_path: Path) -> None:
+    baseline.save(tmp_path / "axis.json")
+    assert ss.Baseline.load(tmp_path / "axis.json") == baseline
+    assert baseline.axis is not None
+    before = baseline.model_copy(update={"axis": baseline.axis.model_copy(update={"changes": None})})
+    warnings = ss.diagnose(before, moved(baseline.loop, 7)).warnings
+    assert any(warning.kind == "changes" and "learn again" in warning.message for warning in warnings)

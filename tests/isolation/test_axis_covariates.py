@@ -9,7 +9,7 @@ import pytest
 
 import servoscope as ss
 from servoscope.core.arrays import FloatArray
-from servoscope.isolation.ml.axis_scan import find_axis_change
+from servoscope.isolation.axis_change import find_axis_change
 from servoscope.signals import clean
 
 RATE, SECONDS = 200.0, 40.0
@@ -55,7 +55,7 @@ def baseline() -> ss.Baseline:
 
 
 def test_a_warm_up_within_a_recording_is_no_change(baseline: ss.Baseline) -> None:
-    """Without the covariates, half of the friction is lost within it, which the scan finds."""
+    """Without the covariates, half of the friction is lost within it, which is found."""
     healthy = warm_axis(50, warming(COLD, WARM))
     assert baseline.axis is not None and baseline.axis.moves is not None
     assert find_axis_change(baseline, healthy) is None

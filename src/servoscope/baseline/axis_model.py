@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from servoscope.baseline.covariates import CovariateModel
-from servoscope.baseline.records import BaselineModel, Matrix
+from servoscope.baseline.records import BaselineModel, Matrix, Vector
 from servoscope.core.arrays import FloatArray
 from servoscope.estimation.axis_filter import NO_LAG, AxisNoise, DriveLag
 from servoscope.models.plants import Fault
@@ -24,9 +24,42 @@ class AxisMoves(BaselineModel):
 
     def factors(self, plant: AxisPlant, channels: Mapping[str, FloatArray]) -> FloatArray:
         """Return what multiplies u and the terms in ``y'' = b u - sum a_i column_i``, shape (1 + terms, N)."""
-        along = dict(zip(self.names, self.covariates.factors(channels).T, strict=True))
+        along = self.by_coefficient(channels)
         inertia = along["inertia"]
         return np.array([1.0 / inertia, *(along[column.coefficient] / inertia for column in plant.acting)])
+
+    def by_coefficient(self, channels: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """Return what multiplies each coefficient along a recording, shape (N,)."""
+        return dict(zip(self.names, self.covariates.factors(channels).T, strict=True))
+
+
+class AxisSums(BaselineModel):
+    """What the sums over blocks of healthy recordings teach of p coefficients, for changes within a recording."""
+
+    names: tuple[str, ...]
+    theta: Vector
+    unit: Vector  # what scatter and changes are relative to
+    kappa: float  # of the noise: the covariance of a block's score is kappa A
+    within: Matrix  # covariances of the coefficients (p, p): between stretches of a recording,
+    between: Matrix  # and recordings
+    inflation: float  # of the covariance of long stretches, for neighbouring blocks err alike
+    degrees: float  # of freedom that `between` is known with
+    unexplained: float  # mean square of what a fit to a block leaves
+    recordings: int
+    left_out: Vector  # evidence of each recording when it is left out of learning [nats]
+    limit: float  # of the evidence
+    rest_speed: float  # below, rows do not count [output per s]
+
+    def at(self, factors: Mapping[str, float], shifts: Mapping[str, float]) -> AxisSums:
+        """Return what `AxisModel.at` does; scatter stays as large, relative to the coefficients."""
+        factor = np.array([factors.get(name, 1.0) for name in self.names])
+        theta = factor * np.array(self.theta) + [shifts.get(name, 0.0) for name in self.names]
+        scaled = {
+            name: tuple(map(tuple, (np.outer(factor, factor) * np.array(getattr(self, name))).tolist()))
+            for name in ("within", "between")
+        }
+        unit = (factor * np.array(self.unit)).tolist()
+        return self.model_copy(update={"theta": tuple(theta.tolist()), "unit": tuple(unit), **scaled})
 
 
 class AxisModel(BaselineModel):
@@ -44,11 +77,13 @@ class AxisModel(BaselineModel):
     drift_std: float  # and how much it may change within one
     # coefficients that the healthy recordings do not show, and how far one recording's estimate may be from them
     unseen: dict[str, float] = Field(default={})
-    # what twice the log-likelihood ratio of a change within a recording has to exceed, where healthy ones exceed what
-    # chance explains; 0 where they do not
-    change_limit: float = 0.0
-    # the same for the squared t statistic of a vibration that begins within a recording
+    # of baselines before 2.0, which looked for changes in another way: read, and not used
+    change_limit: float = Field(default=0.0, exclude=True)
+    # what the squared t statistic of a vibration that begins within a recording has to exceed, where healthy ones
+    # exceed what chance explains; 0 where they do not
     vibration_limit: float = 0.0
+    # None in baselines before 2.0, which find no change within a recording
+    changes: AxisSums | None = Field(default=None, exclude_if=lambda changes: changes is None)
     # what covariates do to the coefficients, which are those of the middle of the learned range then
     moves: AxisMoves | None = Field(default=None, exclude_if=lambda moves: moves is None)
 
@@ -80,7 +115,8 @@ class AxisModel(BaselineModel):
         moved = {
             name: value * factors.get(name, 1.0) + shifts.get(name, 0.0) for name, value in self.coefficients.items()
         }
-        return self.model_copy(update={"coefficients": moved, "moves": None})
+        changes = None if self.changes is None else self.changes.at(factors, shifts)
+        return self.model_copy(update={"coefficients": moved, "moves": None, "changes": changes})
 
     def plant(self, declared: AxisPlant) -> AxisPlant:
         """Return the plant of the loop file with these coefficients."""

@@ -28,7 +28,6 @@ from servoscope.baseline.threshold import (
 from servoscope.core.verdict import JudgeEvidence, Verdict, VerdictKind, decide, evidence_limit, joint_evidence
 from servoscope.evidence.examination import Examination
 from servoscope.evidence.features import PAST_BUDGET
-from servoscope.isolation.ml.axis_scan import FALSE_ALARMS as SCAN_FALSE_ALARMS
 
 MIN_RECORDINGS = 4  # whose scores, each learned without it, are believed
 
@@ -168,7 +167,7 @@ class Account:
         if (change := exam.change) is not None:
             # scatter between recordings, which raises the limit, is none within one
             raised = self.limit - evidence_limit([])
-            yield JudgeEvidence("change", raised - float(np.log(SCAN_FALSE_ALARMS)) * change.excess, inside=True)
+            yield JudgeEvidence("change", raised + change.nats, change.segments, inside=True)
 
 
 def limit_evidence(excess: float, false_alarms: float, recordings: int) -> float:

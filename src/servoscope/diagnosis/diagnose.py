@@ -33,7 +33,6 @@ from servoscope.diagnosis.checks import what_to_check
 from servoscope.diagnosis.explanation import build_headline, build_reasons, unwatched_changes
 from servoscope.diagnosis.own_past import examine_by_own_past, own_past_warning
 from servoscope.diagnosis.recording_alarm import RecordingAlarm, covers, first_alarm, onset_of
-from servoscope.diagnosis.repair import is_repaired, repaired_interval
 from servoscope.diagnosis.result import (
     Diagnosis,
     DiagnosisWarning,
@@ -41,13 +40,14 @@ from servoscope.diagnosis.result import (
     keep_inputs,
     recording_facts,
 )
+from servoscope.diagnosis.segments import moved_coefficients, segment_intervals
 from servoscope.diagnosis.signal_check import (
     judge_both_sides,
     judge_put_right,
     leave_undetermined,
     limit_to_sound_part,
 )
-from servoscope.diagnosis.timeline import trace_timeline
+from servoscope.diagnosis.timeline import is_repaired, trace_timeline
 from servoscope.diagnosis.warnings import (
     detectable_sizes,
     estimate_warnings,
@@ -342,19 +342,19 @@ def _explain_alarm(
     exam: Examination, alarm: RecordingAlarm, progress: Callable[[str], None]
 ) -> tuple[tuple[FaultInterval, ...], Onset, list[DiagnosisWarning]]:
     """Return the intervals that begin with an alarm, the onset of the explained one, and doubts about explanations."""
-    if exam.change is not None and exam.change.vibration is not None:
-        return (ml_refit.vibration_interval(exam, exam.change.vibration),), alarm.onset, []
+    if (change := exam.change) is not None and change.vibration is not None:
+        return (ml_refit.vibration_interval(exam, change.vibration),), alarm.onset, []
+    if change is not None and not change.may_be_single:
+        several = segment_intervals(exam, MIN_CERTAINTY)
+        return several, onset_of(several, exam, alarm), []
     onset, refit, doubts = alarm.onset, None, list[DiagnosisWarning]()
     recursive = candidates = isolate(*isolation_inputs(exam, onset, alarm.evaluation), lambda: progress("isolation"))
     exam.release()
     progress("refit")
-    if exam.change is not None and exam.change.repaired:
-        past = repaired_interval(exam, recursive, MIN_CERTAINTY, lambda: progress("refit"))
-        return (past,), onset, []
     last = int(exam.estimates.index[alarm.evaluation])
     # the refit takes the model for exact, but that of an axis follows the recording; what only a fit to the whole
     # recording tells from healthy is named and sized by that fit
-    seen = exam.change is not None or (
+    seen = change is not None or (
         not exam.drifts
         and exam.recursion_alarm.any()
         and (exam.motion_excess(slice(int(exam.alarm.argmax()), alarm.evaluation + 1)) < UNSEEN_EXCESS).all()
@@ -388,6 +388,7 @@ def _explain_alarm(
         faults=best.faults if best.probability >= MIN_CERTAINTY and best.name != UNKNOWN and not implausible else (),
         candidates=candidates,
         refit=refit,
+        coefficients=() if change is None else moved_coefficients(exam, change.segments[-1]),
     )
     return (interval,), onset, doubts
 

@@ -17,7 +17,7 @@ from servoscope.diagnosis.ml_refit import is_equal_pair
 from servoscope.diagnosis.result import VIBRATION, DiagnosisWarning, FaultInterval, RefitSummary
 from servoscope.estimation.filter_bank import nominal_theta
 from servoscope.evidence.examination import Examination
-from servoscope.isolation.candidate import UNKNOWN, Candidate, FaultEstimate
+from servoscope.isolation.candidate import UNKNOWN, Candidate, CoefficientChange, FaultEstimate
 from servoscope.models.plants import Plant
 
 MIN_CHANGE_STD = 3.0  # standard deviations from which a value has changed
@@ -107,6 +107,12 @@ def _stretch_message(interval: FaultInterval) -> Message:
         when = message("diagnosis.stretch_since", from_s=begin)
     else:
         when = message("diagnosis.stretch_when", from_s=begin, to_s=interval.end_s)
+    if not interval.faults and interval.coefficients:
+        changes = (
+            message("diagnosis.stretch_size", parameter=moved.name, **_size_values(moved))
+            for moved in interval.coefficients
+        )
+        return message("diagnosis.stretch_moved", sizes=tuple(changes), when=when)
     if not interval.faults:
         best = interval.candidates[0]
         return message("diagnosis.stretch_open", names=_labels(best.names), probability=best.probability, when=when)
@@ -149,7 +155,7 @@ def _ambiguous_headline(likely: Sequence[Candidate], at: Message | None, since: 
     return message("diagnosis.fault_ambiguous", **values)
 
 
-def _size_values(fault: FaultEstimate) -> dict[str, float | str]:
+def _size_values(fault: FaultEstimate | CoefficientChange) -> dict[str, float | str]:
     low, high = fault.interval
     return {"ratio": fault.ratio, "low": low, "high": high, "digits": ratio_digits(fault.ratio, low, high)}
 

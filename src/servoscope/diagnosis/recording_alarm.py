@@ -34,12 +34,11 @@ def first_alarm(exam: Examination, progress: Callable[[str], None] = lambda _: N
     sample = crossed if at_once else int(exam.estimates.index[first])
     at = exam.explained
     progress("onset")
-    if (change := exam.change) is not None and change.repaired:
-        began = float(exam.recording.t[0])
-        return RecordingAlarm(sample, at, Onset(began, began, began, 0))
-    if change is not None:
-        low, likely, high = (float(exam.recording.t[k]) for k in change.onset_interval)
-        return RecordingAlarm(change.detected, at, Onset(low, likely, high, change.onset))
+    if (change := exam.change) is not None:
+        # a change that is over may be older than the recording
+        ends = (0, 0, 0) if change.segments and change.segments[0].changed else change.onset_interval
+        low, likely, high = (float(exam.recording.t[k]) for k in ends)
+        return RecordingAlarm(change.detected, at, Onset(low, likely, high, ends[1]))
     if exam.pressures is not None and exam.pressures.excess > 1.0:
         return RecordingAlarm(sample, at, pressure_onset(exam.pressures, exam.recording))
     onset = estimate_onset(

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic import computed_field, model_validator
+from pydantic import Field, computed_field, model_validator
 
 from servoscope.core.above import function_above
 from servoscope.core.errors import OutputError
@@ -25,7 +25,7 @@ from servoscope.core.messages import (
 from servoscope.core.short_repr import ShortRepr
 from servoscope.core.verdict import VerdictKind
 from servoscope.diagnosis.dates import TIMELINES, date_timeline
-from servoscope.isolation.candidate import Candidate, FaultEstimate, ResultModel
+from servoscope.isolation.candidate import Candidate, CoefficientChange, FaultEstimate, ResultModel
 from servoscope.signals import Defect, Recording
 from servoscope.signals.recording import frame_of
 
@@ -161,7 +161,8 @@ class FaultInterval(ResultModel):
     probability: float | None = None  # of the first candidate
     faults: tuple[FaultEstimate, ...] = ()  # those that are named; none where no candidate reaches probability 0.95
     candidates: tuple[Candidate, ...] = ()  # most probable first
-    refit: RefitSummary | None = None  # what the candidates rest on; None where the recursion alone found them
+    refit: RefitSummary | None = None  # what the candidates rest on; None where the recursion or sums found them
+    coefficients: tuple[CoefficientChange, ...] = Field(default=(), exclude_if=lambda moved: not moved)
 
 
 class Provenance(ResultModel):
@@ -178,6 +179,7 @@ WRITTEN_INTERVAL = frozenset(FaultInterval.model_fields) - {
     "end_s",
     "end_interval_s",
     "from_start",
+    "coefficients",
 }  # fields that a Diagnosis repeats
 
 

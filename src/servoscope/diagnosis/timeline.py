@@ -10,6 +10,7 @@ import numpy as np
 from servoscope.detection.onset import Onset
 from servoscope.diagnosis.ml_refit import refit_candidates, summarise_refit
 from servoscope.diagnosis.result import FaultInterval
+from servoscope.diagnosis.segments import segment_intervals
 from servoscope.evidence.examination import Examination
 from servoscope.isolation.candidate import UNKNOWN, Candidate
 from servoscope.isolation.ml import MAX_WINDOW_SAMPLES, RefitResult, TimelineStretch, find_timeline, is_constant
@@ -31,8 +32,11 @@ def trace_timeline(
     Looked at from the refit's first sample on, where its single change does not explain the recording, does not last,
     or does not stay the same. A stretch that nothing explains leaves the single change as it was.
     """
-    if exam.baseline.axis is not None:  # its search knows linear plants only
-        return ()
+    if exam.baseline.axis is not None:
+        # the search knows linear plants only; where the refit has no name for the change of an axis, sums may have one
+        unnamed = exam.change is not None and (refined.is_unknown or refined.hypotheses[0].probability < sure)
+        told = segment_intervals(exam, sure) if unnamed else ()
+        return told if all(interval.faults for interval in told) else ()
     explained = not refined.is_unknown and refined.goodness.statistic <= refined.goodness.limit
     lasts = bool(exam.alarm[-1]) and not refined.onset.profile.duration  # a drift may be steps
     if explained and lasts and is_constant(refined):
@@ -47,6 +51,13 @@ def trace_timeline(
     if any(stretch.refit is not None and stretch.refit.is_unknown for stretch in timeline):
         return ()
     return _fault_intervals(exam, timeline, first, recursive, sure, 3.0 * exam.pipeline.bank.wait / rate)
+
+
+def is_repaired(exam: Examination, intervals: Sequence[FaultInterval]) -> bool:
+    """Return whether a change that is as old as the recording was over at a time that is known, and nothing since."""
+    if len(intervals) != 1 or exam.alarm[-1] or (exam.features is not None and exam.features.changed is not None):
+        return False
+    return intervals[0].from_start and intervals[0].end_interval_s is not None
 
 
 def _fault_intervals(

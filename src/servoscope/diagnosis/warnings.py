@@ -86,6 +86,9 @@ def estimate_warnings(exam: Examination) -> list[DiagnosisWarning]:
         replaced = exam.skipped_share > MAX_SKIPPED_SHARE
         key = "warning.instrument_replaced" if replaced else "warning.instrument"
         warnings.append(warning_throughout(exam, "instrument", message(key, share=exam.skipped_share)))
+    if exam.baseline.axis is not None and exam.baseline.axis.changes is None:
+        names = tuple(source.name for source in exam.baseline.sources)
+        warnings.append(warning_throughout(exam, "changes", message("warning.no_changes", names=names)))
     if exam.noise_growth > 1.0:
         louder = message("warning.noise", factor=float(np.sqrt(exam.noise_growth)))
         warnings.append(warning_throughout(exam, "noise", louder))

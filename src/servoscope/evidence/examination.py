@@ -29,7 +29,7 @@ from servoscope.detection.trace import UNSEEN_EXCESS, Statistic, any_exceeded, d
 from servoscope.detection.warm_up import follow_warm_up
 from servoscope.estimation.noise_model import WhiteNoise
 from servoscope.estimation.pipeline import Estimates, EstimationRunner, Pipeline, Tuning
-from servoscope.isolation.ml.axis_scan import AxisChange, find_axis_change
+from servoscope.isolation.axis_change import AxisChange, find_axis_change
 from servoscope.models.plants import Plant
 from servoscope.signals import Recording
 from servoscope.simulation.stability import settling_samples
@@ -215,9 +215,7 @@ class Examination:
         if change is None:  # what is left of u speaks of the whole recording
             off = (self.residual_ratios > 1.0).any() or (self.pressures is not None and self.pressures.excess > 1.0)
             return np.asarray((index == index[-1:].sum()) & off)
-        if change.repaired:
-            return np.asarray(index < change.onset)
-        return np.asarray(index >= index[-1:].min(initial=change.detected))  # or detected after the last evaluation
+        return change.holds(index)
 
     @cached_property
     def alarm(self) -> BoolArray:

@@ -18,6 +18,14 @@ class ResultModel(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+class CoefficientChange(ResultModel):
+    """A coefficient that has moved, whatever explains that: its ratio to the learned value, with a 95 % interval."""
+
+    name: str
+    ratio: float
+    interval: tuple[float, float]
+
+
 class FaultEstimate(ResultModel):
     """A fault with its size: `ratio` of `parameter` to its healthy value, and the 95 % interval of it.
 

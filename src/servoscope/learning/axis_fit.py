@@ -15,8 +15,8 @@ from servoscope.core.messages import Message, message
 from servoscope.estimation.axis_filter import NO_LAG, AxisFilter, AxisNoise, AxisSignals, DriveLag, axis_stride
 from servoscope.fit.search import Experiment, fit
 from servoscope.fit.tuning import sandwich_covariance, sum_covariance
-from servoscope.isolation.ml.axis_scan import HEALTHY_MARGIN, largest_changes, scan_limit
-from servoscope.isolation.ml.axis_vibration import BANDS
+from servoscope.isolation.axis_change import HEALTHY_MARGIN, largest_vibration, learn_changes
+from servoscope.isolation.ml.axis_vibration import BANDS, scan_limit
 from servoscope.isolation.ml.axis_window import LONG_RUN_S, axis_signals
 from servoscope.isolation.ml.least_squares import normalise_columns
 from servoscope.models.loop import Loop
@@ -31,8 +31,8 @@ MIN_SCATTER = 0.01
 FORCE_OFFSET_SHARE = 0.05  # of the force (rms), by which the constant one may differ between recordings and within one
 MIN_COEFFICIENT_STDS = 3.0  # standard deviations from which a coefficient is seen
 MAX_SCATTER_ROUNDS = 30  # steps in which coefficients and their scatter agree
-FALSE_ALARMS = 1.0 / 200.0  # share of healthy recordings that change within themselves beyond a learned limit
-MIN_LOG_LIKELIHOOD_GAIN = 1.0  # of a likelihood ratio whose logarithm counts
+FALSE_ALARMS = 1.0 / 200.0  # share of healthy recordings that vibrate beyond a learned limit
+MIN_STATISTIC = 1.0  # of a vibration whose logarithm counts
 MIN_SAMPLES_PER_COLUMN = 10  # samples in motion
 # samples that the fit of the noise leaves per column, of those in motion up to a share: a filter that forgets rests
 # slowly would leave a handful of a y whose noise looks like them, and explain these perfectly
@@ -279,30 +279,24 @@ def fit_axis(
         drift_std=FORCE_OFFSET_SHARE * force,
         unseen=dict(zip(of_unseen, off[unseen].tolist(), strict=True)),
         moves=moves,
+        changes=learn_changes(loop, recordings, moves),
     )
-    model, own_notes = _with_own_limits(loop, model, recordings)
+    model, own_notes = _with_own_limit(loop, model, recordings)
     return model, [*notes, *own_notes]
 
 
-def _with_own_limits(loop: Loop, model: AxisModel, recordings: Sequence[Recording]) -> tuple[AxisModel, list[Message]]:
-    """Return the axis with what a change within a recording has to exceed where healthy ones change themselves."""
-    changes, shaken = zip(*(largest_changes(loop, model, recording) for recording in recordings), strict=True)
-    limits, notes = {}, []
-    for key, key_message, own, usual in (
-        ("change_limit", "learning.axis_own_change", changes, scan_limit(len(model.visible_faults(loop.plant.faults)))),
-        ("vibration_limit", "learning.axis_own_vibration", shaken, scan_limit(BANDS)),
-    ):
-        most = max(own)
-        # the machine does what the terms do not know, and chance alone is no longer what a change has to exceed
-        limit = (
-            score_limit([max(gain, MIN_LOG_LIKELIHOOD_GAIN) for gain in own], FALSE_ALARMS)
-            if HEALTHY_MARGIN * most > usual
-            else 0.0
-        )
-        if limit > usual:
-            limits[key] = limit
-            notes.append(message(key_message, name=recordings[own.index(most)].name, times=limit / usual))
-    return model.model_copy(update=limits), notes
+def _with_own_limit(loop: Loop, model: AxisModel, recordings: Sequence[Recording]) -> tuple[AxisModel, list[Message]]:
+    """Return the axis with what a vibration within a recording has to exceed where healthy ones vibrate themselves."""
+    shaken, usual = [largest_vibration(loop, model, recording) for recording in recordings], scan_limit(BANDS)
+    if HEALTHY_MARGIN * max(shaken) <= usual:
+        return model, []
+    limit = score_limit([max(statistic, MIN_STATISTIC) for statistic in shaken], FALSE_ALARMS)
+    if limit <= usual:
+        return model, []
+    name = recordings[int(np.argmax(shaken))].name
+    return model.model_copy(update={"vibration_limit": limit}), [
+        message("learning.axis_own_vibration", name=name, times=limit / usual)
+    ]
 
 
 def combine_fits(fits: Sequence[AxisFit], n: int) -> tuple[FloatArray, FloatArray]:

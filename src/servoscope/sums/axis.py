@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -24,6 +24,9 @@ MIN_PERIODS = 2.0  # of the cutoff in a block, so that it outlasts the memory of
 FASTER = 4.0  # times the cutoff, with which the speed is taken that shows a rest
 REST_SHARE = 0.02  # of the largest speed, below which an axis rests
 
+Factors = Callable[[Mapping[str, FloatArray]], Mapping[str, FloatArray]]
+"""Channels of a recording to what multiplies each coefficient along it, shape (N,)."""
+
 
 @dataclass(frozen=True, eq=False)
 class AxisEquations:
@@ -31,16 +34,22 @@ class AxisEquations:
 
     pipeline: Pipeline
     rest_speed: float = 0.0  # at which rows do not count, and for as long afterwards as the filters remember
+    factors: Factors | None = None  # of covariates, which move the coefficients within a recording
 
     @classmethod
-    def of_healthy(cls, loop: Loop, recordings: Sequence[Recording]) -> AxisEquations:
+    def of_loop(cls, loop: Loop, rest_speed: float = 0.0, factors: Factors | None = None) -> AxisEquations:
+        """Return the equations of a loop. Raises LoopError as `Pipeline.of`."""
+        plain = {"structure": "svf", "estimator": "akf", "two_stage": "none"}
+        monitor = loop.monitor.model_copy(update=plain)
+        return cls(Pipeline.of(loop.model_copy(update={"monitor": monitor})), rest_speed, factors)
+
+    @classmethod
+    def of_healthy(cls, loop: Loop, recordings: Sequence[Recording], factors: Factors | None = None) -> AxisEquations:
         """Return the equations of a loop; healthy recordings show how fast it moves.
 
         At rest, friction is whatever holds the axis. Raises LoopError as `Pipeline.of`.
         """
-        plain = {"structure": "svf", "estimator": "akf", "two_stage": "none"}
-        monitor = loop.monitor.model_copy(update=plain)
-        equations = cls(Pipeline.of(loop.model_copy(update={"monitor": monitor})))
+        equations = cls.of_loop(loop, factors=factors)
         return replace(equations, rest_speed=REST_SHARE * max(map(equations.largest_speed, recordings)))
 
     @cached_property
@@ -131,8 +140,11 @@ class SumsRunner:
         """Return eta and phi of each sample, shape (N, 1 + p); rows that do not count are 0."""
         regression = self._regression.advance(block.r, block.u, block.y, block.restart)
         counted = regression.ok & self._is_moving(block)
-        ones = np.ones((len(block.t), 1))
-        rows = np.column_stack([regression.eta, regression.phi[:, self._order], ones])
+        phi, equations = regression.phi[:, self._order], self._equations
+        if equations.factors is not None:
+            along = equations.factors(block.channels)
+            phi = phi * np.column_stack([along[name] for name in equations.names[:-1]])
+        rows = np.column_stack([regression.eta, phi, np.ones(len(block.t))])
         return np.where(counted[:, None], rows, 0.0)
 
     def advance(self, block: Recording) -> Sums:

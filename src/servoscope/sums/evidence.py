@@ -38,6 +38,11 @@ def posterior(M: FloatArray, w: FloatArray, S: FloatArray) -> tuple[FloatArray, 
     return np.einsum("...ij,...j->...i", P, w), np.asarray(0.5 * (P + np.swapaxes(P, -1, -2)))
 
 
+def running_sums(a: FloatArray) -> FloatArray:
+    """Return the sums of all rows before each, shape (K + 1, ...)."""
+    return np.concatenate([np.zeros_like(a[:1]), np.cumsum(a, axis=0)])
+
+
 class ChangePrior(NamedTuple):
     """How coefficients of a stretch deviate: healthy, along the direction of one cause, or anyhow."""
 

@@ -11,22 +11,23 @@ from servoscope.core.arrays import FloatArray
 from servoscope.core.verdict import evidence_limit
 from servoscope.sums.evidence import ChangePrior, posterior
 from servoscope.sums.records import Equations, Sums
+from servoscope.sums.scatter import block_weights
 
 CHANGE_STD = 0.5  # standard deviation of a change, relative to the coefficient
 CHANGE_COST = 3.0  # nats that a stretch with coefficients of its own has to gain
 EFFECT_STEPS = 4  # of reweighting
+STRETCH_S = 15.0  # over which coefficients of one recording are compared
 
 
 @dataclass(frozen=True, eq=False)
 class Healthy:
-    """Healthy coefficients of a block: ``theta x + B + E_stretch + E_block``, each effect with its covariance."""
+    """Healthy coefficients of a stretch: ``theta x + B + E``, each effect with its covariance."""
 
     equations: Equations
     theta: FloatArray  # by covariate, shape (p, m)
     unit: FloatArray  # what a coefficient's scatter and changes are relative to, shape (p,)
     kappa: float  # of the noise: the covariance of a block's score is kappa A
-    between_blocks: FloatArray  # covariances (p, p): of the model's error by block,
-    within: FloatArray  # of stretches of one recording,
+    within: FloatArray  # covariances (p, p): of stretches of one recording,
     between: FloatArray  # and of recordings
     inflation: float  # of the covariance of long stretches, for neighbouring blocks err alike
     degrees: float  # of freedom that `between` is known with
@@ -45,13 +46,12 @@ class Healthy:
 
     def information(self, sums: Sums, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return information (K, p, p) and score (K, p) of each block about coefficients (p,)."""
-        A, g = sums.A, sums.c - sums.A @ theta
-        louder = np.maximum(sums.unexplained / self.unexplained, 1.0)
-        V = self.kappa * louder[:, None, None] * A + A @ self.between_blocks @ A
-        V += np.diag(1e-9 * np.diag(V.mean(axis=0)) + np.finfo(np.float64).tiny)
-        solved = np.linalg.solve(V, np.concatenate([A, g[..., None]], axis=2)) / self.inflation
-        M = A @ solved[..., :-1]
-        return 0.5 * (M + np.swapaxes(M, 1, 2)), np.einsum("kij,kj->ki", A, solved[..., -1])
+        louder = self.kappa * np.maximum(sums.unexplained / self.unexplained, 1.0)
+        M, w = sums.A / louder[:, None, None], (sums.c - sums.A @ theta) / louder[:, None]
+        if not len(w):
+            return M, w
+        counts = block_weights(M, w, self.wide, round(STRETCH_S / sums.block_s)) / self.inflation
+        return M * counts[:, None, None], w * counts[:, None]
 
     def change_prior(self, x: FloatArray) -> ChangePrior:
         """Return how coefficients deviate: as healthy ones, by one cause, or anyhow."""

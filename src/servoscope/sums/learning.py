@@ -10,12 +10,11 @@ import numpy as np
 from servoscope.core.arrays import FloatArray
 from servoscope.core.errors import NotEnoughError
 from servoscope.core.verdict import FALSE_ALARMS, evidence_limit
-from servoscope.sums.healthy import CHANGE_STD, Healthy
+from servoscope.sums.healthy import CHANGE_STD, STRETCH_S, Healthy
 from servoscope.sums.records import Equations, Sums
 from servoscope.sums.scatter import PRIOR_DOF, block_noise, floor_variance, random_effect
 from servoscope.sums.verdict import sums_evidence
 
-STRETCH_S = 15.0  # over which coefficients are compared within a recording
 CHUNKS = 2, 4, 8  # blocks, over which errors may hang together
 MAX_SQUARE = 25.0  # of a standardised score, for the inflation
 MIN_UNIT_SHARE = 0.3  # of the typical share of u, which a coefficient near 0 is measured by
@@ -49,13 +48,13 @@ def _fitted(equations: Equations, sums: Sequence[Sums], unit: FloatArray | None 
     unit = _unit(theta, sums) if unit is None else unit
     own = [np.linalg.solve(s.A.sum(axis=0) + ridge / len(sums), s.c.sum(axis=0)) for s in sums]
     scores = np.concatenate([s.c - s.A @ fit for s, fit in zip(sums, own, strict=True)])
-    kappa, between_blocks = block_noise(np.concatenate([s.A for s in sums]), scores, unit, len(sums))
+    kappa = block_noise(np.concatenate([s.A for s in sums]), scores, len(sums))
     p, m = len(theta), len(sums[0].x)
     left = np.concatenate([s.unexplained for s in sums])
     unexplained = float(left.sum() / max(np.count_nonzero(left), 1)) + np.finfo(np.float64).tiny
     floor = np.diag(floor_variance(unit))
     theta, none = theta[:, None] * np.eye(1, m), np.zeros((m, m))
-    healthy = Healthy(equations, theta, unit, kappa, between_blocks, floor, floor, 1.0, 1.0, unexplained, none)
+    healthy = Healthy(equations, theta, unit, kappa, floor, floor, 1.0, 1.0, unexplained, none)
     healthy = replace(healthy, inflation=_inflation(healthy, sums, own))
     healthy = _with_recordings(replace(healthy, within=_within(healthy, sums, own)), sums)
     free = np.isin(np.arange(p), equations.free)

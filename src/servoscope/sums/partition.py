@@ -35,11 +35,6 @@ class Partition(NamedTuple):
     stretches: tuple[Stretch, ...]
 
 
-def running_sums(a: FloatArray) -> FloatArray:
-    """Return the sums of all rows before each, shape (K + 1, ...)."""
-    return np.concatenate([np.zeros_like(a[:1]), np.cumsum(a, axis=0)])
-
-
 def partition(
     M: FloatArray, w: FloatArray, prior: ChangePrior, cut: float, shortest: int, *, changes: bool = True
 ) -> Partition:

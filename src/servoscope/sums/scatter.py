@@ -5,15 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from servoscope.core.arrays import FloatArray
-from servoscope.sums.evidence import posterior
+from servoscope.sums.evidence import posterior, running_sums
 
 STEPS = 200  # of the maximisation
 PRIOR_DOF = 2.0  # recordings that the floor of a scatter counts for
 FLOOR = 0.004  # of every scatter, relative: no two healthy days are more alike
-FIRST_SHARE = 0.1  # of a coefficient, at which its scatter between blocks starts at most
 MIN_SHARE = 0.1  # of the usual excitation, from which a block shows the noise
-MAX_BLOCKS = 1000  # that the noise is estimated from
 RIDGE = 1e-6
+TAIL_DEGREES = 4.0  # of freedom of Student's t, of which the scores of blocks are
 
 
 def floor_variance(unit: FloatArray) -> FloatArray:
@@ -40,33 +39,37 @@ def random_effect(M: FloatArray, w: FloatArray, floor: FloatArray, lost: float =
     return _shrunk(S, (K - lost) / (K - lost + p))
 
 
-def block_noise(A: FloatArray, g: FloatArray, unit: FloatArray, recordings: int) -> tuple[float, FloatArray]:
-    """Return kappa and S of scores ``g ~ N(0, kappa A + A S A)`` of blocks (K, p) about their recording's own fit.
-
-    S is the error of the model by block: it follows the motion, and does not fall with the samples of a block.
-    """
+def block_noise(A: FloatArray, g: FloatArray, recordings: int) -> float:
+    """Return kappa of scores ``g ~ N(0, kappa A)`` of blocks (K, p) about their recording's own fit."""
     usual = np.diag(A.mean(axis=0))
     shown = np.flatnonzero((np.diagonal(A, axis1=1, axis2=2) / usual).mean(axis=1) > MIN_SHARE)
-    shown = shown[:: -(-len(shown) // MAX_BLOCKS)]
     A, g = A[shown], g[shown]
     K, p = g.shape
-    regular = A + RIDGE * np.diag(usual)
-    own = np.linalg.solve(regular, g[..., None])[..., 0]
-    kappa = float(np.median(np.einsum("ki,ki->k", g, own)) / p) + 1e-300
-    floor = floor_variance(unit)
-    S = np.diag(np.clip(0.5 * np.median(own**2, axis=0), floor, (FIRST_SHARE * unit) ** 2))
-    for _ in range(STEPS):
-        mean, P = posterior(A / kappa, g / kappa, S)
-        left = g - np.einsum("kij,kj->ki", A, mean)
-        solved = np.linalg.solve(regular, left[..., None])[..., 0]
-        level = float((np.einsum("ki,ki->k", left, solved) + np.einsum("kij,kji->k", A, P)).mean() / p)
-        grown = (P.sum(axis=0) + mean.T @ mean + PRIOR_DOF * np.diag(floor)) / (K + PRIOR_DOF)
-        done = abs(level / kappa - 1.0) < 1e-3 and _is_settled(S, grown, floor, 1e-3)
-        kappa, S = max(level, 1e-12 * kappa), grown
-        if done:
-            break
+    solved = np.linalg.solve(A + RIDGE * np.diag(usual), g[..., None])[..., 0]
     counted = max(K - recordings, 1)  # each recording's own fit took one away
-    return kappa * K / counted, _shrunk(S, counted / (counted + p)) * K / counted
+    return float(np.einsum("ki,ki->", g, solved) / (p * counted) + np.finfo(np.float64).tiny)
+
+
+def block_weights(M: FloatArray, w: FloatArray, prior: FloatArray, length: int) -> FloatArray:
+    """Return by how much each block counts, at most 1, shape (K,), as of Student's t (Lange, Little and Taylor, 1989).
+
+    A block that agrees with so many blocks before it, or with those after it, counts in full, so that a change costs
+    nothing; one that agrees with neither, as in slow motion, where friction is no term, hardly does. M (K, p, p) and
+    w (K, p): information and score of each; `prior` (p, p): covariance of the coefficients of its neighbours.
+    """
+    K, p = w.shape
+    sums_M, sums_w, at = running_sums(M), running_sums(w), np.arange(K)
+    I = np.eye(p)
+    ridge = (1e-9 * M.diagonal(axis1=1, axis2=2) + np.finfo(np.float64).tiny)[:, :, None] * I
+    square = np.full(K, np.inf)
+    for begin, end in ((np.maximum(at - length, 0), at), (at + 1, np.minimum(at + 1 + length, K))):
+        theta, P = posterior(sums_M[end] - sums_M[begin], sums_w[end] - sums_w[begin], prior)
+        off = w - np.einsum("kij,kj->ki", M, theta)
+        # off' (M + M P M)^-1 off, which is that of the estimate of a block, in what it shows
+        estimate, known = np.linalg.solve(np.array([M + ridge, I + M @ P]), off[..., None])[..., 0]
+        apart = np.einsum("ki,ki->k", estimate, known)
+        square = np.where(end > begin, np.minimum(square, apart), square)
+    return np.asarray(np.minimum((TAIL_DEGREES + p) / (TAIL_DEGREES + square), 1.0))
 
 
 def _is_settled(S: FloatArray, grown: FloatArray, floor: FloatArray, share: float) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -9,10 +10,10 @@ import numpy as np
 
 from servoscope.core.arrays import FloatArray
 from servoscope.core.verdict import Explanation, JudgeEvidence, Segment, Verdict, decide
-from servoscope.sums.evidence import ChangePrior, evidence, posterior
+from servoscope.sums.evidence import ChangePrior, evidence, posterior, running_sums
 from servoscope.sums.explanation import explanations
 from servoscope.sums.healthy import CHANGE_COST, Healthy
-from servoscope.sums.partition import Stretch, partition, running_sums
+from servoscope.sums.partition import Stretch, partition
 from servoscope.sums.records import Sums
 
 Times = tuple[float, float, float]
@@ -184,3 +185,21 @@ def sums_evidence(healthy: Healthy, sums: Sums) -> JudgeEvidence:
         nats = min(nats, account.evidence - judgement.with_healthy_cuts() + CHANGE_COST)
     stretches = judgement.states(account.stretches) if nats > healthy.limit else (Stretch(0, judgement.blocks, False),)
     return JudgeEvidence("sums", nats, judgement.segments(stretches), len(stretches) > 1)
+
+
+def detection_s(healthy: Healthy, sums: Sums, segments: Sequence[Segment]) -> float:
+    """Return when what had been measured by then was enough for the first change within a recording [s].
+
+    Of a repair, whose beginning is known afterwards, that is the latest time at which it may have come.
+    """
+    judgement, begins = _Judgement(healthy, sums), [segment.begin_s[1] for segment in segments]
+    first, second = segments[:2]
+    if not second.changed:
+        return second.begin_s[2]
+    begin, end = [*np.searchsorted(sums.begin_s, begins[1:3]).tolist(), judgement.blocks][:2]
+    B = judgement.effect(*judgement.of(0, begin)) if not first.changed else np.zeros(len(judgement.mean))
+    at = np.arange(begin + 1, end + 1)
+    M, w = judgement.M[at] - judgement.M[begin], judgement.w[at] - judgement.w[begin]
+    kept, changed = judgement.prior.evidence(M, w - M @ B)
+    enough = np.flatnonzero(changed - kept - judgement.cut_cost > 0.0)
+    return float(sums.begin_s[at[enough[0] if len(enough) else -1] - 1]) + sums.block_s

@@ -22,6 +22,8 @@ MIN_AMPLITUDE_RATIO = 2.0  # times the healthy amplitude: by less than that the 
 EDGE_BLOCKS = 5  # blocks at both ends, in which no onset is looked for
 MIN_COUNTED_SHARE = 0.25  # share of a block's samples that have to count
 LAGS = 8  # samples of the autocovariance by which a vibration is told from noise
+FALSE_ALARMS = 1e-4  # share of healthy recordings that are called changed
+MIN_EDGE_SHARE = 0.01  # of a stretch, at its ends, in which no onset is tried
 MIN_SQUARES = 1e-9  # of squares left; a simulation without noise leaves none
 MIN_NOISE_SHARE = 0.3  # of what was added, that louder noise leaves unexplained at least where it is none
 
@@ -107,6 +109,18 @@ def find_vibration(
     onset = (max(first - blocks.size, 0), int(begin), min(last + blocks.size, window.samples - 1))
     detected = max(int(blocks.begin[told - 1]) + blocks.size - 1, int(begin))
     return AxisVibration(ratio, (low, high), onset, detected, float(t[k, band] ** 2))
+
+
+def scan_limit(tests: int, false_alarms: float = FALSE_ALARMS) -> float:
+    """Return what the largest likelihood ratio of all onsets exceeds in a share of healthy stretches.
+
+    ``P(sup > x) = sqrt(x/(2 pi)) exp(-x/2) (2 log((1 - t)/t) (1 - 1/x) + 2/x)`` for one parameter, onsets from t to
+    1 - t (James, James and Siegmund, 1987), times the number of tests.
+    """
+    x = np.linspace(5.0, 60.0, 2000)
+    range_ = 2.0 * np.log((1.0 - MIN_EDGE_SHARE) / MIN_EDGE_SHARE)
+    probability = tests * np.sqrt(x / (2.0 * np.pi)) * np.exp(-x / 2.0) * (range_ * (1.0 - 1.0 / x) + 2.0 / x)
+    return float(x[np.argmax(probability <= false_alarms)])
 
 
 def _largest(blocks: _BandEnergies, count: int) -> float:
