@@ -139,7 +139,11 @@ class Broker:
 
 
 class Client:
-    """What `create_mqtt_client` returns to the service: a client of paho-mqtt, as far as it is used."""
+    """What `create_mqtt_client` returns to the service: a client of paho-mqtt, as far as it is used.
+
+    As paho's, it has one thread, in which all that it calls follows each other: a connection's end is told after the
+    last message of that connection, and before the next one is tried.
+    """
 
     thread_s = 0.0
 
@@ -147,6 +151,7 @@ class Client:
         self._broker, self.name, self.cable, self._receive = broker, name, "service", receive
         self.on_connect = self.on_connect_fail = self.on_disconnect = lambda *_: None
         self.process, self.pumping, self._wanted, self._connected = process, False, False, False
+        self._events, self._works = deque[Callable[[], None]](), False  # what its thread has still to do
         self.acknowledged: Callable[[str, bytes], None] = lambda *_: None
         self.received: Callable[[str], None] = lambda _: None
 
@@ -161,9 +166,21 @@ class Client:
 
     def loop_start(self) -> None:
         """Connect soon."""
-        self._broker.clock.spawn(self._try, process=self.process, after=LATENCY_S)
+        self._put(self._try)
+
+    def _put(self, event: Callable[[], None]) -> None:
+        self._events.append(event)
+        if not self._works:
+            self._works = True
+            self._broker.clock.spawn(self._work, process=self.process)
+
+    def _work(self) -> None:
+        while self._events:
+            self._events.popleft()()
+        self._works = False
 
     def _try(self) -> None:
+        self._broker.clock.sleep(LATENCY_S)
         while self._wanted and not self._connected:
             if self._broker.connect(self):
                 self._connected = True
@@ -178,8 +195,8 @@ class Client:
             self._connected = False
             self._broker.lose(self)
             if self.process is None or not self.process.dead:
-                self.on_disconnect(self, None, None, SimpleNamespace(value=0x80), None)
-                self.loop_start()
+                self._put(lambda: self.on_disconnect(self, None, None, SimpleNamespace(value=0x80), None))
+                self._put(self._try)
 
     def disconnect(self) -> None:
         """End the connection on purpose, or because the process is gone."""
@@ -211,13 +228,14 @@ class Client:
         self._point("confirm after")
 
     def take(self, message: tuple[str, bytes, bool], mid: int) -> None:
-        """Take a message from the broker, in the client's thread."""
+        """Take a message from the broker."""
         from servoscope.service.mqtt.paho_clients import ReceivedMessage
 
         assert self._receive is not None
         topic, content, retain = message
         self.received(topic)
-        self._receive(ReceivedMessage(topic, content, 1, mid, retain))
+        receive, received = self._receive, ReceivedMessage(topic, content, 1, mid, retain)
+        self._put(lambda: receive(received))
 
     def ack(self, mid: int, qos: int) -> None:
         """Acknowledge a message."""

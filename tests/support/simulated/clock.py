@@ -14,6 +14,8 @@ from greenlet import GreenletExit, getcurrent, greenlet
 
 BEGAN = 1767225580.0  # 2025-12-31T23:59:40Z: coefficients are stored in the middle of what is sent
 
+LOCKED_S = 0.001  # after which who waits for a lock looks again
+
 
 class Killed(BaseException):
     """A process has lost its power; nothing catches it that catches exceptions."""
@@ -133,6 +135,23 @@ class _Event:
         return self._is_set
 
 
+class _Lock:
+    """Excludes all participants but one; who waits for it lets time pass."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock, self._is_held = clock, False
+
+    def __enter__(self) -> bool:
+        while self._is_held:
+            assert self._clock.process is not None, "nobody but a process waits for its lock"
+            self._clock.sleep(LOCKED_S)
+        self._is_held = True
+        return True
+
+    def __exit__(self, *_: object) -> None:
+        self._is_held = False
+
+
 class _Thread:
     def __init__(
         self, clock: Clock, target: Callable[..., None], args: tuple[Any, ...] = (), name: str = "", daemon: bool = True
@@ -182,7 +201,7 @@ def clock_changes(clock: Clock, sleep: Callable[[float], None]) -> list[tuple[An
         monotonic_ns=lambda: int(clock.now * 1e9),
     )
     threads = SimpleNamespace(
-        Thread=lambda **given: _Thread(clock, **given), Event=lambda: _Event(clock), Lock=threading.Lock
+        Thread=lambda **given: _Thread(clock, **given), Event=lambda: _Event(clock), Lock=lambda: _Lock(clock)
     )
     own = [module for name, module in sys.modules.items() if name.startswith("servoscope.service")]
     changes = [(module, "time", times) for module in own if getattr(module, "time", None) is time]
