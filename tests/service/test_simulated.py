@@ -38,6 +38,6 @@ def test_a_seed_repeats_its_history() -> None:
 def test_planted_faults_are_found(name: str) -> None:
     for seed in range(5):
         with PLANTED[name]():
-            if World(seed, STEPS).run().broken:
+            if World(seed, 500).run().broken:
                 return
     pytest.fail(f"a service that {name} passes")

@@ -274,7 +274,7 @@ class Service(ServiceParts):
             if silence >= HOUSEKEEPING_EVERY_S and not is_expected:
                 result = asset.advance_time(silence * source.clock_rate)
                 self.handle_result(asset, result)
-                has_changed |= bool(result.rows)
+                has_changed |= bool(result.rows) or not result.repeatable
             if has_changed:
                 self.writer.set_checkpoint(asset)
 

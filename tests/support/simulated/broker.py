@@ -235,7 +235,10 @@ class Client:
         topic, content, retain = message
         self.received(topic)
         receive, received = self._receive, ReceivedMessage(topic, content, 1, mid, retain)
-        self._put(lambda: receive(received))
+        if self._works:
+            self._put(lambda: receive(received))
+        else:  # the thread has nothing else to do, and a message takes no time
+            receive(received)
 
     def ack(self, mid: int, qos: int) -> None:
         """Acknowledge a message."""

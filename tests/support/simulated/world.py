@@ -122,7 +122,7 @@ class Ground:
         self.work = self.folder / "work"
         self.storage = Storage(self.work / "world.sqlite")
         self._files: dict[bytes, Any] = {}
-        self._monitors: dict[int, Monitor] = {}
+        self._monitors: dict[str, Monitor] = {}  # by the hash of a baseline: its address may be another one's later
         self.clean()
         self.config = ServiceFile.load(self.work / "hall.toml")
         for baseline in (halls.baseline(),):
@@ -141,11 +141,11 @@ class Ground:
     def _baseline(self) -> bytes:
         return halls.baseline().to_text().encode()
 
-    def monitor(self, baseline: Any) -> Monitor:
-        """Return the monitor of a baseline, which is made once."""
-        if id(baseline) not in self._monitors:
-            self._monitors[id(baseline)] = Monitor(baseline)
-        return self._monitors[id(baseline)]
+    def monitor(self, machine: LoopMachine) -> Monitor:
+        """Return the monitor of a machine, which is made once."""
+        if machine.hash not in self._monitors:
+            self._monitors[machine.hash] = Monitor(machine.baseline)
+        return self._monitors[machine.hash]
 
     def load_machine(self, path: Path) -> Any:
         """Return the machine of a file, which is parsed once."""
@@ -356,7 +356,7 @@ class World:
         yield StoreWriter, "_seal", lambda writer: self._seal(writer)
         # what is the same for all histories is read and compiled once
         yield build, "load_machine", self.ground.load_machine
-        yield LoopMachine, "follower", lambda machine: self.ground.monitor(machine.baseline)
+        yield LoopMachine, "follower", lambda machine: self.ground.monitor(machine)
         yield build, "compile_examination", lambda _: None
         yield ServiceFile, "load_again", lambda config, _: config
         yield log.LOGGER, "disabled", True

@@ -254,14 +254,13 @@ class Asset(StateHolder):
             return self._result
         now = (state := self.take_state()).position.t + elapsed_s
         # before its first block it waits: that is told by its reception, and not as the silence of a sensor
-        quality_state, changed = state.quality, tuple[quality.QualityFinding, ...]()
-        if self.heard:
-            quality_state, changed = quality.tick(self._limits, state.quality, now)
-            self._ticked |= bool(changed)
+        quality_state, changed = quality.tick(self._limits, state.quality, now) if self.heard else (state.quality, ())
+        self._ticked |= bool(changed)
         self.state = replace(state, quality=quality_state)
         if changed or self.reception != RECEPTION_OK or "silent" in quality.active_findings(quality_state):
             self._advance_alarms(now)
-        return self._result
+        conditions = ([alarm.condition for alarm in at.alarms.values()] for at in (state, self.take_state()))
+        return self._result._replace(repeatable=next(conditions) == next(conditions))
 
     def execute(self, alarm: str, command: OperatorCommand) -> StepResult:
         """Execute an operator's command.

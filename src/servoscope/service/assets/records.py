@@ -36,7 +36,9 @@ class StepResult(NamedTuple):
     rows: list[TableRow]
     transitions: list[AlarmTransition]
     refusal: BlockRefusal | None = None  # why the block was left out, if it was
-    repeatable: bool = False  # whether the block leads from the state before it to that after it, and to nothing else
+    repeatable: bool = (
+        False  # whether blocks, or time alone, lead from the state before it to that after it, and to nothing else
+    )
 
 
 def audit_row(event: str, document: dict[str, Any], user: str = "servoscope") -> TableRow:
