@@ -25,12 +25,14 @@ test: style     ## what must pass before a commit: format, lint, types, all test
 test-all: style  ## the same with the slow ones: browsers, Spark, kills and chaos (REQUIRE_ALL=1: no test may skip)
 
 test: SELECTION := -m "not slow"
+test: WORKERS := 2
+test-all: WORKERS := 3  # the slow ones wait for servers and browsers about as long as they compute
 # a busy machine may be late for what waits for servers and browsers: what failed has one more try, with nothing beside it
 test-all: AGAIN := --last-failed --last-failed-no-failures none
 # types are checked beside the first tests, on what these leave of two cores; what mypy says stands below their results
 test test-all:
 	@mkdir -p .cache; $(TYPES) >.cache/types.log 2>&1 & types=$$!; \
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(SELECTION); tests=$$?; \
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(SELECTION); tests=$$?; \
 	if [ $$tests = 1 ] && [ -n "$(AGAIN)" ]; then $(BIN)/python -m pytest -n 0 $(AGAIN); tests=$$?; fi; \
 	wait $$types; types=$$?; echo '$(TYPES)'; cat .cache/types.log; exit $$((tests || types))
 
