@@ -42,7 +42,7 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         batch.checkpoints[name] = stored(name, situation)
         if situation.full is not None:
             t = ONSET + 20.0 if situation.full is WAS else NOW
-            row = {"asset": name, "number": 1, "t": t, "grounds": "full", **situation.full.columns()}
+            row = {"asset": name, "number": 1, "t": t, "grounds": "full", **situation.full.columns("")}
             batch.rows["diagnoses"].append(row)
     for name, situation in LATER.items():
         gone = not situation.status["alarms"]["fault"]["active"]
