@@ -28,10 +28,14 @@ def learn(equations: Equations, sums: Sequence[Sums], false_alarms: float = FALS
     Raises
     ------
     NotEnoughError
-        If there is no recording with as many blocks as coefficients.
+        If there is no recording with as many blocks as coefficients, or the motion excites a coefficient not at all.
     """
     if not any(len(recording.c) >= len(equations.names) for recording in sums):
         raise NotEnoughError("sums: no recording has as many blocks as there are coefficients, take longer ones")
+    energy = np.sum([recording.A.sum(axis=0) for recording in sums], axis=0).diagonal()
+    if not energy.all():
+        name = equations.names[int(energy.argmin())]
+        raise NotEnoughError(f"sums: the motion does not excite {name} below the cutoff, raise it or leave the term out")
     healthy = _fitted(equations, sums)
     scores = []
     if len(sums) >= MIN_LEFT_OUT:
