@@ -60,7 +60,7 @@ def test_why_and_the_refit_beside_the_recursion(loop: Loop) -> None:
         ):
             assert words in page.text, words
         assert not page.wrong
-        assert len([attrs for tag, attrs in page.tags if tag == "svg" and attrs.get("role") == "img"]) == 6
+        assert len([attrs for tag, attrs in page.tags if tag == "svg" and attrs.get("role") == "img"]) == 7
     assert Diagnosis.model_validate_json(diagnosis.model_dump_json()) == diagnosis
 
 

@@ -74,13 +74,13 @@ def test_the_noise_of_a_coarse_position_keeps_thirty_samples_a_column() -> None:
 
 @pytest.mark.parametrize("case", ["open-loop-staircase"], indirect=True)
 def test_steps_of_an_experiment_are_not_stuck(case: Path) -> None:
-    """The gain is 0.8 from 30 s on: u is 1.25 of what it was."""
+    """The gain is 0.8 from 30 s on, which three steps of 0.4 Hz hardly tell from another weight."""
     loop = init(case / "healthy.csv").loop
     learned = ss.learn(loop, [ss.read(case / f"{name}.csv", loop) for name in ("healthy", "healthy2")])
     diagnosis = ss.diagnose(learned, ss.read(case / "gain08_from_half.csv", loop))
-    (fault,) = diagnosis.faults
-    assert fault.ratio == pytest.approx(1.25, rel=0.02)
-    assert diagnosis.onset_s is not None and diagnosis.onset_s[1] == pytest.approx(30.0, abs=0.2)
+    assert diagnosis.verdict == "fault" and diagnosis.candidates[0].name == "motor_constant"
+    assert diagnosis.candidates[0].faults[0].ratio == pytest.approx(1.25, rel=0.06)
+    assert diagnosis.onset_s is not None and diagnosis.onset_s[0] < 30.0 < diagnosis.onset_s[2]
 
 
 def test_a_controller_that_stops_within_its_log_is_stuck() -> None:

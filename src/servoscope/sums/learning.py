@@ -20,6 +20,7 @@ MAX_SQUARE = 25.0  # of a standardised score, for the inflation
 MIN_UNIT_SHARE = 0.3  # of the typical share of u, which a coefficient near 0 is measured by
 SLOPE = 0.3  # by how much a standard deviation of a covariate may move a coefficient, relative
 MIN_LEFT_OUT = 3
+MIN_NOISE_SHARE = 1e-10  # of the mean square of u: no log knows it better than to five digits
 
 
 def learn(equations: Equations, sums: Sequence[Sums], false_alarms: float = FALSE_ALARMS) -> Healthy:
@@ -52,7 +53,8 @@ def _fitted(equations: Equations, sums: Sequence[Sums], unit: FloatArray | None 
     unit = _unit(theta, sums) if unit is None else unit
     own = [np.linalg.solve(s.A.sum(axis=0) + ridge / len(sums), s.c.sum(axis=0)) for s in sums]
     scores = np.concatenate([s.c - s.A @ fit for s, fit in zip(sums, own, strict=True)])
-    kappa = block_noise(np.concatenate([s.A for s in sums]), scores, len(sums))
+    noise = block_noise(np.concatenate([s.A for s in sums]), scores, len(sums))
+    kappa = max(noise, MIN_NOISE_SHARE * float(theta @ A @ theta) / sum(int(s.n.sum()) for s in sums))
     p, m = len(theta), len(sums[0].x)
     left = np.concatenate([s.unexplained for s in sums])
     unexplained = float(left.sum() / max(np.count_nonzero(left), 1)) + np.finfo(np.float64).tiny
@@ -92,7 +94,8 @@ def _inflation(healthy: Healthy, sums: Sequence[Sums], own: Sequence[FloatArray]
             continue
         M, w = (np.concatenate(part) for part in zip(*parts, strict=True))
         lost = 1.0 - length / float(np.mean([len(w) for _, w in blocks]))  # each is about a fit of its own
-        squares = np.einsum("ki,ki->k", w, np.linalg.solve(M + 1e-9 * M.mean(axis=0), w[..., None])[..., 0])
+        ridge = 1e-9 * np.diag(np.diag(M.mean(axis=0))) + np.finfo(np.float64).tiny * np.eye(p)
+        squares = np.einsum("ki,ki->k", w, np.linalg.solve(M + ridge, w[..., None])[..., 0])
         ratios.append(float(np.mean(np.minimum(squares / p / lost, MAX_SQUARE))))
     return max(ratios)
 

@@ -66,7 +66,7 @@ def block_weights(M: FloatArray, w: FloatArray, prior: FloatArray, length: int) 
         theta, P = posterior(sums_M[end] - sums_M[begin], sums_w[end] - sums_w[begin], prior)
         off = w - np.einsum("kij,kj->ki", M, theta)
         # off' (M + M P M)^-1 off, which is that of the estimate of a block, in what it shows
-        estimate, known = np.linalg.solve(np.array([M + ridge, I + M @ P]), off[..., None])[..., 0]
+        known, estimate = np.linalg.solve(np.array([I + (M + ridge) @ P, M + ridge]), off[..., None])[..., 0]
         apart = np.einsum("ki,ki->k", estimate, known)
         square = np.where(end > begin, np.minimum(square, apart), square)
     return np.asarray(np.minimum((TAIL_DEGREES + p) / (TAIL_DEGREES + square), 1.0))

@@ -87,7 +87,7 @@ static int y_should_move(const @{prefix}_signals *s)
 /* Tell whether a controller sets u: r is logged, and u no staircase. */
 static int is_controlled(const @{prefix}_signals *s, double u)
 {
-    const double share = @{quality.CHANGED_SHARE | c} * (double)(s->u_samples - s->same[SIGNAL_U]);
+    const double share = @{quality.CHANGED_SHARE | c} * ((double)s->u_samples - (double)s->same[SIGNAL_U]);
     double of_r[2];
 
     recent_range(s, SIGNAL_R, of_r);
