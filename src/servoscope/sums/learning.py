@@ -36,7 +36,9 @@ def learn(equations: Equations, sums: Sequence[Sums], false_alarms: float = FALS
     energy = np.sum([recording.A.sum(axis=0) for recording in sums], axis=0).diagonal()
     if not energy.all():
         name = equations.names[int(energy.argmin())]
-        raise NotEnoughError(f"sums: the motion does not excite {name} below the cutoff, raise it or leave the term out")
+        raise NotEnoughError(
+            f"sums: the motion does not excite {name} below the cutoff, raise it or leave the term out"
+        )
     healthy = _fitted(equations, sums)
     scores = []
     if len(sums) >= MIN_LEFT_OUT:
