@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Self
+import math
+from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from servoscope.baseline.learned_fault import SEVERITY
 from servoscope.models.plants import Plant
 
 UNKNOWN = "unknown"
+
+
+def _open_ends(interval: Any) -> Any:
+    """Return an interval as JSON has it, null for an end that nothing bounds, with infinite ends."""
+    if isinstance(interval, (list, tuple)) and len(interval) == 2:
+        return tuple(
+            open_end if end is None else end for end, open_end in zip(interval, (-math.inf, math.inf), strict=True)
+        )
+    return interval
+
+
+Interval = Annotated[tuple[float, float], BeforeValidator(_open_ends)]
 
 
 class ResultModel(BaseModel):
@@ -23,7 +36,7 @@ class CoefficientChange(ResultModel):
 
     name: str
     ratio: float
-    interval: tuple[float, float]
+    interval: Interval
 
 
 class FaultEstimate(ResultModel):
@@ -35,7 +48,7 @@ class FaultEstimate(ResultModel):
     name: str
     parameter: str
     ratio: float
-    interval: tuple[float, float]
+    interval: Interval
     # of a payload at a place that the loop file knows: its mass [kg] and the 95 % interval of it
     mass_kg: tuple[float, float, float] | None = Field(default=None, exclude_if=lambda value: value is None)
 
