@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import sys
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -22,6 +21,7 @@ from typing import Any
 
 from packaging.utils import canonicalize_name
 from packaging.version import InvalidVersion, Version
+from sbom import read_version
 
 ROOT = Path(__file__).resolve().parent.parent
 ADVISORIES = Path("scripts", "advisories.json")
@@ -94,8 +94,7 @@ def take_records(export: Path, versions: dict[str, Version]) -> dict[str, Any]:
 def state_exposure(advisories: dict[str, Any], root: Path) -> dict[str, Any]:
     """Return an OpenVEX document: for each advisory on a package that a release installs, whether it applies."""
     versions = locked_versions(root, LOCK_FILES[:1])
-    source = (root / "src" / "servoscope" / "__init__.py").read_text(encoding="utf-8")
-    release = re.findall(r'^__version__ = "(.+)"', source, re.MULTILINE)[0]
+    release = read_version(root)
     statements = []
     for record in advisories["vulns"]:
         for affected in record["affected"]:

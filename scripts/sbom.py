@@ -59,11 +59,16 @@ def find_licence(name: str) -> dict[str, Any] | None:
     return {"license": {"name": text}} if text else None
 
 
+def read_version(root: Path) -> str:
+    """Return the version of the source in a folder."""
+    source = (root / "src" / "servoscope" / "__init__.py").read_text(encoding="utf-8")
+    return re.findall(r'^__version__ = "(.+)"', source, re.MULTILINE)[0]
+
+
 def bill(root: Path) -> dict[str, Any]:
     """Return the bill of materials of the source in a folder."""
     project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    source = (root / "src" / "servoscope" / "__init__.py").read_text(encoding="utf-8")
-    version = re.findall(r'^__version__ = "(.+)"', source, re.MULTILINE)[0]
+    version = read_version(root)
     ref = f"pkg:pypi/{project['name']}@{version}"
     components = [component(*one) for one in read_lock((root / "requirements.lock").read_text(encoding="utf-8"))]
     subject = {"type": "application", "bom-ref": ref, "name": project["name"], "version": version, "purl": ref}

@@ -17,11 +17,12 @@ from typing import NamedTuple
 from scipy.stats import binomtest
 from tables import Table, parser, show
 
+from public.cranfield import CYCLE_S
+
 BENCHMARKS = Path(__file__).resolve().parent.parent
 DETECTORS = ("servoscope", "rms of u", "T^2 of features", "inverse + CUSUM")
 COLOURS = ("#0b5fa5", "#9aa5b1", "#c58b2a", "#6b8e5a")
 PICTURE = BENCHMARKS.parent / "docs" / "images" / "benchmarks.svg"
-CYCLE_S = 12.96  # of a run of the ball screw
 WIDTH, LEFT, BAR, GAP = 760, 250, 11, 14  # pixels
 
 

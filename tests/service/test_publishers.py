@@ -162,9 +162,9 @@ def test_only_what_has_changed_is_rendered_and_all_files_are_as_if_everything_we
     rendered = list[list[str]]()
     render = AasPublisher.render
 
-    def noted(self: AasPublisher, statuses: Any, changed: Any) -> Any:
+    def noted(self: AasPublisher, changed: Any) -> Any:
         rendered.append(sorted(changed))
-        return render(self, statuses, changed)
+        return render(self, changed)
 
     monkeypatch.setattr(AasPublisher, "render", noted)
     stored = {**status(), "counted": {"began": 0.0, "t": 1767225640.0}}
@@ -254,3 +254,16 @@ def test_a_work_list_is_read_by_others_and_stays_as_it_is_while_only_samples_com
     outlet.publish({name: {**stored[name], **NOTHING} for name in ("lift", "press")})
     outlet.close()
     assert files[0].read_bytes() == to_csv([]).encode() and json.loads(files[1].read_text()) == []
+
+
+def test_a_size_without_an_upper_bound_is_an_open_interval(tmp_path: Path) -> None:
+    """The store keeps an infinite end as null."""
+    fault = {"name": "leakage", "parameter": "C_ie", "ratio": 3.0, "interval": [0.5, None]}
+    stored = {**status(), "counted": {"began": 0.0, "t": 1767225640.0}, "verdict": "fault", "faults": [fault]}
+    for kind in ("aas", "ros2", "worklist"):
+        outlet = find_kinds(PUBLISHERS)[kind].load()(kind=kind, path=kind, every_s=600.0).create("twin", tmp_path)
+        outlet.open({"press": stored})
+        outlet.close()
+    (item, *_) = json.loads((tmp_path / "worklist" / "worklist.json").read_text())
+    assert (item["size_low"], item["size_high"]) == (0.5, None)
+    assert '"max": "INF"' in (tmp_path / "aas" / "press.json").read_text()

@@ -259,8 +259,8 @@ class Asset(StateHolder):
         self.state = replace(state, quality=quality_state)
         if changed or self.reception != RECEPTION_OK or "silent" in quality.active_findings(quality_state):
             self._advance_alarms(now)
-        conditions = ([alarm.condition for alarm in at.alarms.values()] for at in (state, self.take_state()))
-        return self._result._replace(repeatable=next(conditions) == next(conditions))
+        before, after = ([alarm.condition for alarm in at.alarms.values()] for at in (state, self.take_state()))
+        return self._result._replace(repeatable=before == after)
 
     def execute(self, alarm: str, command: OperatorCommand) -> StepResult:
         """Execute an operator's command.

@@ -40,6 +40,11 @@ class Announcement(NamedTuple):
     confirmed: bool = False  # whether somebody has said that what has changed since is no fault
 
 
+def has_newer_size(faults: Sequence[str], sized_fault: str | None, sized: float | None, named: float | None) -> bool:
+    """Return whether the size of an examination at `sized` is that of the only fault, named at `named` or before."""
+    return list(faults) == [sized_fault] and (sized or 0.0) >= (named or 0.0)
+
+
 @dataclass(frozen=True)
 class PendingDiagnosis:
     """A full diagnosis that is due: number of its row, first sequence, end of its window [UTC s], and the reason."""
@@ -81,8 +86,8 @@ class ExaminationState:
     @property
     def newest_faults(self) -> list[dict[str, Any]]:
         """Its faults with their newest sizes."""
-        known = [fault["name"] for fault in self.faults]
-        is_newer = bool(self.size) and known == [self.size["name"]] and (self.sized or 0.0) >= (self.diagnosed or 0.0)
+        names = [fault["name"] for fault in self.faults]
+        is_newer = has_newer_size(names, self.size.get("name"), self.sized, self.diagnosed)
         return [self.size] if is_newer else self.faults
 
     def to_json(self) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from servoscope.service.alarms import (
     evaluate_ne107,
 )
 from servoscope.service.assets.checkpoint import AssetState, StreamPosition
-from servoscope.service.assets.examination_schedule import Announcement, ExaminationState
+from servoscope.service.assets.examination_schedule import Announcement, ExaminationState, has_newer_size
 from servoscope.service.assets.outlook import Outlook, OutlookWord, current_outlook
 from servoscope.service.assets.reception import RECEPTION_OK, Reception, ReceptionState
 from servoscope.service.assets.residual_history import EvaluationStatus
@@ -121,8 +121,8 @@ class AssetStatus(AssetVerdict, EvaluationStatus):
     @property
     def newest_sizes(self) -> tuple[tuple[FaultEstimate, ...], float | None]:
         """The newest sizes of its faults, and when they were found [UTC s], None where that is not known."""
-        follows = self.size is not None and [self.size.name] == [fault.name for fault in self.faults]
-        if follows and self.size is not None and (self.sized or 0.0) >= (self.diagnosed or 0.0):
+        names = [fault.name for fault in self.faults]
+        if self.size is not None and has_newer_size(names, self.size.name, self.sized, self.diagnosed):
             return (self.size,), self.sized
         return self.faults, self.diagnosed
 

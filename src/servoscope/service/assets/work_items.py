@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable
 from datetime import UTC, datetime
 from typing import NamedTuple
@@ -24,7 +25,7 @@ class WorkItem(NamedTuple):
     since: str
     parameter: str
     size: float | None
-    size_low: float | None  # ends of the 95 % interval
+    size_low: float | None  # ends of the 95 % interval; None: nothing bounds it there
     size_high: float | None
     check: tuple[str, ...]  # what to check on the machine
     urgency: Priority
@@ -55,12 +56,13 @@ def _faults(asset: str, status: AssetStatus, alarms: Iterable[AlarmStatus]) -> I
     since = status.since if status.onset is None else status.onset
     urgency, known = _most_urgent([alarm for alarm in alarms if (alarm.ne107 or WEAR) == WEAR]), status.metadata
     for fault in faults:
+        low, high = (end if math.isfinite(end) else None for end in fault.interval)
         finding = known.faults.get(fault.name, fault.name)
         yield _item(asset, status, fault.name, finding, since, urgency, status.ne107)._replace(
             parameter=fault.parameter,
             size=fault.ratio,
-            size_low=fault.interval[0],
-            size_high=fault.interval[1],
+            size_low=low,
+            size_high=high,
             check=known.checks.get(fault.name, ()),
             due=_due(status, fault.name),
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -17,8 +17,7 @@ from urllib.parse import quote
 
 from servoscope.core.settings import NonEmptyStr
 from servoscope.service.assets.outlook import DAY_S, Outlook
-from servoscope.service.assets.status import AssetStatus, read_status
-from servoscope.service.publishers.base import StatusByAsset
+from servoscope.service.assets.status import AssetStatus
 from servoscope.service.publishers.files import FilesPublisher, FilesSettings
 
 CONDITION = "urn:servoscope:submodel:Condition:1:0"
@@ -49,15 +48,13 @@ class AasPublisher(FilesPublisher):
         super().__init__(folder / settings.path, settings.every_s)
         self._prefix = settings.prefix
 
-    def render(self, statuses: StatusByAsset, changed: Collection[str]) -> Mapping[str, bytes]:
+    def render(self, changed: Mapping[str, AssetStatus]) -> Mapping[str, bytes]:
         """Return the two files of each asset that has changed."""
         files: dict[str, bytes] = {}
-        for name in changed:
-            status = read_status(statuses[name])
-            if isinstance(status, AssetStatus):
-                file = quote(name, safe="")
-                environment = json.dumps(shell(name, status, self._prefix), indent=1).encode()
-                files |= {f"{file}.json": environment, f"{file}.aasx": package(environment)}
+        for name, status in changed.items():
+            file = quote(name, safe="")
+            environment = json.dumps(shell(name, status, self._prefix), indent=1).encode()
+            files |= {f"{file}.json": environment, f"{file}.aasx": package(environment)}
         return files
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from servoscope.core.errors import OutputError
 from servoscope.core.files import atomic_write, make_folder
 from servoscope.core.settings import NonEmptyStr, Positive
+from servoscope.service.assets.status import AssetStatus, read_status
 from servoscope.service.publishers.base import PublisherSettings, StatusByAsset
 
 
@@ -25,18 +26,14 @@ class FilesPublisher:
 
     def __init__(self, folder: Path, every_s: float) -> None:
         self._folder, self._every_s = folder, every_s
-        self._statuses: dict[str, Mapping[str, Any]] = {}
-        self._changed = set[str]()  # assets whose files are not yet up to date
+        self._changed: dict[str, Mapping[str, Any]] = {}  # statuses of the assets whose files are not yet up to date
         self._written: dict[str, bytes] = {}
         self._lock, self._stopping = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="files", daemon=True)
         self.trouble = ""  # why the files are not up to date
 
-    def render(self, statuses: StatusByAsset, changed: Collection[str]) -> Mapping[str, bytes]:
-        """Return by name the contents of the files that say something of the assets that have changed.
-
-        `statuses`: of all assets, without the service itself.
-        """
+    def render(self, changed: Mapping[str, AssetStatus]) -> Mapping[str, bytes]:
+        """Return by name the contents of the files that say something of the assets that have changed."""
         raise NotImplementedError
 
     def open(self, statuses: StatusByAsset) -> None:
@@ -48,10 +45,9 @@ class FilesPublisher:
 
     def publish(self, statuses: StatusByAsset) -> None:
         """Take what has been stored."""
-        assets = {name: status for name, status in statuses.items() if "verdict" in status}
         with self._lock:
-            self._statuses |= assets
-            self._changed |= assets.keys()
+            # without the service itself
+            self._changed |= {name: status for name, status in statuses.items() if "verdict" in status}
 
     def _run(self) -> None:
         while not self._stopping.wait(self._every_s):
@@ -59,10 +55,11 @@ class FilesPublisher:
 
     def _write(self) -> None:
         with self._lock:
-            statuses, changed = dict(self._statuses), self._changed
-            self._changed = set()
+            changed, self._changed = self._changed, {}
+        statuses = {name: read_status(stored) for name, stored in changed.items()}
+        assets = {name: status for name, status in statuses.items() if isinstance(status, AssetStatus)}
         try:
-            for name, content in self.render(statuses, changed).items():
+            for name, content in self.render(assets).items():
                 if self._written.get(name) != content:
                     atomic_write(self._folder / name, content)
                     self._written[name] = content
@@ -70,7 +67,7 @@ class FilesPublisher:
         except OutputError as error:  # a full disk, a share that is away: the next look tries again
             self.trouble = str(error)
             with self._lock:
-                self._changed |= changed
+                self._changed = changed | self._changed
 
     def close(self) -> None:
         """Write what is left, and stop."""

@@ -17,9 +17,8 @@ from typing import Any, Literal
 
 from servoscope.service.alarms import Ne107
 from servoscope.service.alarms.settings import PRIORITIES
-from servoscope.service.assets.status import AssetStatus, read_status
+from servoscope.service.assets.status import AssetStatus
 from servoscope.service.assets.work_items import WorkItem, work_items
-from servoscope.service.publishers.base import StatusByAsset
 from servoscope.service.publishers.files import FilesPublisher, FilesSettings
 
 FILE = "ros2.json"
@@ -52,16 +51,14 @@ class Ros2Publisher(FilesPublisher):
             for report in json.loads((folder / FILE).read_bytes())["reports"]:
                 self._reports[report["fault_code"]] = passed(report) | {"source_id": report["source_id"]}
 
-    def render(self, statuses: StatusByAsset, changed: Collection[str]) -> Mapping[str, bytes]:
+    def render(self, changed: Mapping[str, AssetStatus]) -> Mapping[str, bytes]:
         """Return the file."""
-        for name in changed:
-            status = read_status(statuses[name])
-            if isinstance(status, AssetStatus):
-                items = work_items(name, status)
-                self._diagnostics[name] = diagnostic_status(name, status, items)
-                ours = {code: old for code, old in self._reports.items() if old["source_id"] == source_id(name)}
-                self._reports |= {code: passed(report) for code, report in ours.items()}
-                self._reports |= {report["fault_code"]: report for report in map(failed, items)}
+        for name, status in changed.items():
+            items = work_items(name, status)
+            self._diagnostics[name] = diagnostic_status(name, status, items)
+            ours = {code: old for code, old in self._reports.items() if old["source_id"] == source_id(name)}
+            self._reports |= {code: passed(report) for code, report in ours.items()}
+            self._reports |= {report["fault_code"]: report for report in map(failed, items)}
         document = {
             "until": time.time() + LOOKS * self._every_s,
             "status": [message for _, message in sorted(self._diagnostics.items())],

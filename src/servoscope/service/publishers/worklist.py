@@ -5,14 +5,13 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Literal
 
 from servoscope.service.alarms.settings import PRIORITIES
-from servoscope.service.assets.status import AssetStatus, read_status
+from servoscope.service.assets.status import AssetStatus
 from servoscope.service.assets.work_items import WorkItem, work_items
-from servoscope.service.publishers.base import StatusByAsset
 from servoscope.service.publishers.files import FilesPublisher, FilesSettings
 
 NAME = "worklist"
@@ -35,11 +34,9 @@ class WorkListPublisher(FilesPublisher):
         super().__init__(folder, every_s)
         self._items: dict[str, list[WorkItem]] = {}
 
-    def render(self, statuses: StatusByAsset, changed: Collection[str]) -> Mapping[str, bytes]:
+    def render(self, changed: Mapping[str, AssetStatus]) -> Mapping[str, bytes]:
         """Return the list in both forms."""
-        for name in changed:
-            status = read_status(statuses[name])
-            self._items[name] = work_items(name, status) if isinstance(status, AssetStatus) else []
+        self._items |= {name: work_items(name, status) for name, status in changed.items()}
         items = [item for of_asset in self._items.values() for item in of_asset]
         items.sort(key=lambda item: (-PRIORITIES.index(item.urgency), item.since, item.key))
         document = [item._asdict() for item in items]
