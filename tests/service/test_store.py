@@ -131,15 +131,15 @@ def test_older_tables_are_migrated_and_newer_ones_refused(url: str, monkeypatch:
 
     released = schema.MIGRATIONS
     monkeypatch.setattr(schema, "MIGRATIONS", [*released, add_a_note])
-    monkeypatch.setattr(schema, "READABLE_FROM", 4)
-    with pytest.raises(StoreError, match=r"version 3, servoscope run brings them to 4"):
+    monkeypatch.setattr(schema, "READABLE_FROM", 5)
+    with pytest.raises(StoreError, match=r"version 4, servoscope run brings them to 5"):
         Store.open(url)
     Store.open(url, write=True).close()
     again = Store.open(url)
     assert again.fetch(sa.select(sa.column("note")).select_from(tables.residuals)) == [{"note": "old"}]
     again.close()
     monkeypatch.setattr(schema, "MIGRATIONS", released)
-    with pytest.raises(StoreError, match=r"of version 4, this servoscope knows up to 3: install a newer one"):
+    with pytest.raises(StoreError, match=r"of version 5, this servoscope knows up to 4: install a newer one"):
         Store.open(url)
 
 

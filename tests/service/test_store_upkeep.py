@@ -28,7 +28,7 @@ from servoscope.service.store.series import read_notes
 
 BEGAN = 1767225600.0  # 2026-01-01T00:00:00Z
 # What each released version of the tables left behind; a new version brings its own.
-STORES = {1: "history.sqlite.gz", 2: "history-2.sqlite.gz", 3: "history-3.sqlite.gz"}
+STORES = {1: "history.sqlite.gz", 2: "history-2.sqlite.gz", 3: "history-3.sqlite.gz", 4: "history-4.sqlite.gz"}
 
 
 def old_store(folder: Path, version: int) -> Path:
@@ -71,7 +71,10 @@ def test_every_version_is_copied_as_it_is_and_migrated_alike_on_both_databases(
     assert done.code == 0, done.err
     assert content(empty) == before
     for url in (str(old), empty):
-        Store.open(url, write=True).close()
+        store = Store.open(url, write=True)
+        (index,) = sa.inspect(store._engine).get_indexes("residuals")
+        assert index["column_names"] == ["asset", "t", "statistic", "level"]
+        store.close()
     after = content(empty)
     assert after == content(str(old))
     assert set(after) == set(tables.METADATA.tables)

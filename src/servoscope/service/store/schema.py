@@ -9,7 +9,7 @@ import sqlalchemy as sa
 
 from servoscope.core.errors import EmptyStoreError, StoreError
 from servoscope.service.store.rows import Row, fault_rows
-from servoscope.service.store.tables import METADATA, bundles, diagnoses, meta, needed, sizes
+from servoscope.service.store.tables import METADATA, bundles, diagnoses, meta, needed, residuals, sizes
 
 
 def _fill_sizes(connection: sa.Connection) -> None:
@@ -29,13 +29,20 @@ def _add_bundles(connection: sa.Connection) -> None:
     needed.create(connection)
 
 
+def _cover_residuals(connection: sa.Connection) -> None:
+    """Make the index of residuals by time anew: before version 4 it held the times alone."""
+    for index in residuals.indexes:
+        index.drop(connection)
+        index.create(connection)
+
+
 Migration = Callable[[sa.Connection], None]
 FIRST_VERSION = 1
 # the first leads from 1 to 2; a step that was released is never changed
-MIGRATIONS: list[Migration] = [_fill_sizes, _add_bundles]
+MIGRATIONS: list[Migration] = [_fill_sizes, _add_bundles, _cover_residuals]
 SIZES_FROM = 2  # version with sizes over time
 BUNDLES_FROM = 3  # version with samples in bundles
-READABLE_FROM = 1  # oldest version that is read as it is: what came later are further tables
+READABLE_FROM = 1  # oldest version that is read as it is: what came later are further tables and an index
 
 
 def schema_version() -> int:
@@ -69,6 +76,8 @@ def create_or_migrate(connection: sa.Connection, name: str, *, write: bool) -> i
             if fault >= READABLE_FROM:
                 return fault
             raise StoreError(f"{where}, servoscope run brings them to {newest}")
+        if connection.dialect.name == "postgresql":  # an index of a hundred million rows takes minutes
+            connection.execute(sa.text("SET LOCAL statement_timeout = 0"))
         for step in MIGRATIONS[fault - FIRST_VERSION :]:
             step(connection)
         connection.execute(meta.update().where(meta.c.key == "schema").values(value=newest))

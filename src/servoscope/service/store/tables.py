@@ -43,8 +43,8 @@ def within(column: sa.Column[float], span: tuple[float | None, float | None]) ->
     return begun if until is None else [*begun, column < until]
 
 
-def _numbered_table(name: str, *columns: sa.Column[object]) -> sa.Table:
-    """Return a table of an asset's numbered rows."""
+def _numbered_table(name: str, *columns: sa.Column[object], covered: tuple[str, ...] = ()) -> sa.Table:
+    """Return a table of an asset's numbered rows; `covered`: columns that its index by time holds, too."""
     return sa.Table(
         name,
         METADATA,
@@ -52,7 +52,7 @@ def _numbered_table(name: str, *columns: sa.Column[object]) -> sa.Table:
         sa.Column("number", sa.BigInteger, primary_key=True, autoincrement=False),
         sa.Column("t", sa.Double, nullable=False),
         *columns,
-        sa.Index(f"{name}_by_time", "asset", "t"),
+        sa.Index(f"{name}_by_time", "asset", "t", *covered),
         sqlite_with_rowid=False,
     )
 
@@ -108,6 +108,7 @@ residuals = _numbered_table(
     sa.Column("statistic", sa.Double, nullable=False),  # the largest since the row before, over its limit
     sa.Column("level", sa.Double, nullable=False),
     sa.Column("residual", sa.JSON, nullable=False),  # per frequency: [Hz, real, imaginary, healthy |H|]
+    covered=("statistic", "level"),  # a long history is thinned by them alone
 )
 diagnoses = _numbered_table(
     "diagnoses",
