@@ -49,6 +49,7 @@ class Broker:
 
     def publish(self, topic: str, content: bytes, retain: bool = False) -> None:
         """Take a message."""
+        self.plan.note(topic, content)
         self.watch(topic, content)
         if retain:
             self.retained[topic] = content

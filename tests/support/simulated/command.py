@@ -25,6 +25,7 @@ MOST_SEEDS = 2000  # within which a planted fault has to be found
 def describe(found: Found) -> str:
     """Return what came of one seed."""
     words = [f"seed {found.seed}: {found.steps} steps, {found.lives} lives, {found.seconds:.0f} s simulated"]
+    words.append(f"  digest {found.digest}")
     words += [f"  {what}" for what in found.trace]
     words.append("  " + ", ".join(f"{name} {number}" for name, number in sorted(found.counts.items())))
     words += [f"  BROKEN {why}" for why in found.broken]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import random
 from collections import Counter
 from typing import NamedTuple
@@ -51,6 +52,7 @@ class Plan:
         self.reached: Counter[tuple[str, str]] = Counter()
         self.trace: list[str] = []
         self.calm = False
+        self._digest = hashlib.blake2b(digest_size=16)
         wanted = [PAIRS[(seed * 7 + k * 31) % len(PAIRS)] for k in range(2)]
         within = [pair for pair in wanted if pair[0] != "outside"]
         within += self.chance.choices(WITHIN, k=self.chance.randrange(2, 7))
@@ -58,6 +60,15 @@ class Plan:
         outside = [place for fault, place in wanted if fault == "outside"]
         outside += self.chance.choices(OUTSIDE, k=self.chance.randrange(3, 9))
         self.outside = sorted((self.chance.randrange(20, max(21, int(0.9 * steps))), place) for place in outside)
+
+    def note(self, *what: object) -> None:
+        """Add to the digest that something has happened: who steps when, each message, and each statement."""
+        self._digest.update(repr(what).encode())
+
+    @property
+    def digest(self) -> str:
+        """The digest of all that has happened, which a seed repeats in every process."""
+        return self._digest.hexdigest()
 
     def _patience(self, place: str) -> int:
         """Return after how many visits of a place a fault strikes: there are many of some, few of others."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sqlite3
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,13 @@ def _failure() -> sqlite3.OperationalError:
     return error
 
 
+def _close(connection: sqlite3.Connection) -> None:
+    """Close a connection, and release its lock: a cursor in a frame that is not collected yet would keep both."""
+    with suppress(sqlite3.ProgrammingError):  # it is closed already
+        connection.rollback()
+    connection.close()
+
+
 class Storage:
     """One engine for all processes of the world, and what its transactions have made durable."""
 
@@ -35,9 +43,12 @@ class Storage:
         self.engine = self._real(url, write=True)
         sa.event.listen(self.engine, "before_cursor_execute", self._before)
         sa.event.listen(self.engine, "after_cursor_execute", self._after)
+        self._connections: list[sqlite3.Connection] = []
+        sa.event.listen(self.engine, "connect", lambda connection, _: self._connections.append(connection))
         dialect = self.engine.dialect
         self._do_commit, self._do_rollback = dialect.do_commit, dialect.do_rollback
         dialect.do_commit, dialect.do_rollback = self._commit, self._rollback
+        dialect.do_close = dialect.do_terminate = _close
         self.clock: Clock | None = None
         self.plan: Plan | None = None
         self._open: dict[int, list[tuple[str, Any]]] = {}  # by connection, what its transaction has written
@@ -48,7 +59,7 @@ class Storage:
         """Begin a history with an empty database."""
         self.clock, self.plan, self.durable, self.away = clock, plan, durable, False
         self._open.clear()
-        self.engine.dispose()
+        self.end()
 
     def create(self, url: sa.URL, **_: Any) -> sa.Engine:
         """Return the engine, whose statements are known already."""
@@ -61,11 +72,23 @@ class Storage:
             place = self._places[statement] = f"{verb} {words[-1].lower()}" if len(words) > 1 else verb
         return place
 
+    def _plain(self, parameters: Any) -> list[Any]:
+        """Return parameters by what they say: the folder has another name in each process."""
+        rows = parameters if isinstance(parameters, list) else [parameters]
+        values = [x for row in rows for x in (row.values() if isinstance(row, dict) else row)]
+        folder = str(self._path.parent)
+        return [
+            bytes(x) if isinstance(x, memoryview) else x.replace(folder, "") if isinstance(x, str) else x
+            for x in values
+        ]
+
     def _point(self, place: str) -> str:
         return point(self.clock, self.plan, place) if self.clock and self.plan else ""
 
     def _before(self, connection: Any, _cursor: Any, statement: str, parameters: Any, *_: Any) -> None:
         place = self._place(statement)
+        if self.plan is not None:
+            self.plan.note(place, *self._plain(parameters))
         if place == "begin":
             self._open[id(connection.connection.dbapi_connection)] = []  # a killed process may have left something
         if self.away or self._point(f"{place} before") == "error":
@@ -82,6 +105,8 @@ class Storage:
     def _commit(self, connection: Any) -> None:
         written = self._open.pop(id(connection.dbapi_connection), [])
         place = "commit" if any("meta" in where for where, _ in written) else "commit read"
+        if self.plan is not None:
+            self.plan.note(place)
         fault = self._point(f"{place} before")
         if fault == "lost" or self.away:
             self._do_rollback(connection)
@@ -94,4 +119,12 @@ class Storage:
 
     def _rollback(self, connection: Any) -> None:
         self._open.pop(id(connection.dbapi_connection), None)
-        self._do_rollback(connection)
+        with suppress(sqlite3.ProgrammingError):  # of a process that is gone
+            self._do_rollback(connection)
+
+    def end(self) -> None:
+        """Close all connections, as the operating system does when their process ends: with them go their locks."""
+        for connection in self._connections:
+            _close(connection)
+        self._connections.clear()
+        self.engine.dispose()

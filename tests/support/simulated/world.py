@@ -101,6 +101,7 @@ class Found:
     reached: Counter[tuple[str, str]] = field(default_factory=Counter)
     counts: Counter[str] = field(default_factory=Counter)  # rows of each table, deliveries ...
     seconds: float = 0.0  # simulated
+    digest: str = ""  # of all that happened
 
 
 @functools.cache
@@ -124,13 +125,14 @@ class Ground:
         self._files: dict[bytes, Any] = {}
         self._monitors: dict[str, Monitor] = {}  # by the hash of a baseline: its address may be another one's later
         self.clean()
+        self.storage.engine.connect().close()  # the first connection of an engine asks its database what it can
         self.config = ServiceFile.load(self.work / "hall.toml")
         for baseline in (halls.baseline(),):
             build.compile_examination(baseline)
 
     def clean(self) -> None:
         """Leave only what a plant has before its first start."""
-        self.storage.engine.dispose()
+        self.storage.end()
         shutil.rmtree(self.work, ignore_errors=True)
         self.work.mkdir()
         shutil.copyfile(self.template, self.work / "world.sqlite")
@@ -208,6 +210,7 @@ class World:
                 self.ground.storage.clock = None
         found = self.found
         found.reached, found.trace = self.plan.reached, self.plan.trace
+        found.digest = self.plan.digest
         found.seconds = self.clock.now - 1000.0
         return found
 
@@ -220,6 +223,7 @@ class World:
             while todo and todo[0][0] <= self.clock.steps:
                 self._happen(todo.pop(0)[1])
             self.clock.step()
+            self.plan.note(self.clock.steps, self.clock.now)
             self.invariants.step()
         self.found.steps = min(self.clock.steps, self.steps)
         if not self.found.broken:
@@ -238,6 +242,7 @@ class World:
                 return
             for _ in range(10):
                 self.clock.step()
+            self.plan.note(self.clock.steps, self.clock.now)
         self.over = True
         if self.service is not None:
             self.service.stop()
@@ -278,7 +283,7 @@ class World:
                 lock.release()
             self._clients.clear()
             self._locks.clear()
-            self.ground.storage.engine.dispose()
+            self.ground.storage.end()
             if not self.over:
                 self._start(self.plan.chance.uniform(0.2, 2.0))
 
