@@ -128,8 +128,8 @@ def test_a_slow_file_holds_up_its_own_asset_and_no_other_one(
         return (files[0].name != "press_0.csv.gz" or end.wait()) and parse(folder, files, *arguments)
 
     monkeypatch.setattr(log_reader, "parse_files", wait)
-    monkeypatch.setattr(log_reader, "QUICK_S", 0.2)
-    monkeypatch.setattr(log_reader, "FIRST_S", 0.2)
+    monkeypatch.setattr(log_reader, "QUICK_S", 1.0)
+    monkeypatch.setattr(log_reader, "FIRST_S", 1.0)
     for k in range(3):
         packed = gzip.compress(csv(*rows(20 * k, 20)).encode())
         hall.put(f"press_{k}.csv.gz", packed)
