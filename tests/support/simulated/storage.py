@@ -56,10 +56,9 @@ class Storage:
         self.away = False
 
     def begin(self, clock: Clock, plan: Plan, durable: Callable[[list[tuple[str, Any]]], None]) -> None:
-        """Begin a history with an empty database."""
+        """Begin a history on a clean ground, whose connections have ended."""
         self.clock, self.plan, self.durable, self.away = clock, plan, durable, False
         self._open.clear()
-        self.end()
 
     def create(self, url: sa.URL, **_: Any) -> sa.Engine:
         """Return the engine, whose statements are known already."""
